@@ -1,0 +1,51 @@
+"""What every test runs under: 64-bit, strict promotion, one thread for host linear algebra, seeds as fixtures.
+
+Strict is stricter than what a user has. A test that must see JAX as users run it asks for the fixture `user_mode`.
+"""
+
+import os
+
+# Before NumPy is imported: on few cores the threads of OpenBLAS cost more than they bring (a 300 x 300 Cholesky took 235 ms).
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# No figure may open a window.
+os.environ.setdefault("MPLBACKEND", "agg")
+
+import hypothesis
+import jax
+import numpy as np
+import pytest
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+# Compiling inside an example breaks any deadline; a suite that draws new examples each day cannot be bisected.
+hypothesis.settings.register_profile("repeatable", deadline=None, derandomize=True)
+hypothesis.settings.load_profile("repeatable")
+
+SEED = 20260101
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    """A fresh NumPy generator, the same for every test and every order of tests."""
+    return np.random.default_rng(SEED)
+
+
+@pytest.fixture
+def key() -> jax.Array:
+    """A fresh JAX random key, the same for every test."""
+    return jax.random.key(SEED)
+
+
+@pytest.fixture
+def user_mode():
+    """JAX as it is out of the box: 32-bit, standard dtype promotion, rank promotion allowed."""
+    with jax.enable_x64(False), jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        yield
+
+
+@pytest.fixture(params=["float32", "float64"])
+def dtype(request) -> np.dtype:
+    """Each of the two precisions in turn, both under the strict flags."""
+    return np.dtype(request.param)

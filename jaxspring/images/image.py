@@ -1,0 +1,143 @@
+"""A one-channel image as a height over the plane: pixels, their physical spacing, and how to read between them.
+
+Position component 0 is x, along the columns; component 1 is y, along the rows. Pixel `values[j, i]` is a node at
+
+    x = origin_x + i spacing_x        y = origin_y + j spacing_y        [m]
+
+so with spacing 1 and origin 0, `values[y, x]` sits at `(x, y)`. Outside the outermost pixels the coordinate is clamped: the value is
+that of the nearest border point and the slope across the border is exactly zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jax.typing import ArrayLike
+from jaxtyping import Array
+
+from .sampling import Bilinear, Sampling
+from .surface import Surface
+
+PerAxis = float | Array | Sequence[float] | Sequence[Array]
+
+
+class Image(eqx.Module):
+    """One channel of pixels with a physical spacing. Pixels, spacing and origin are all differentiable.
+
+    Attributes:
+        values: pixels `(ny, nx)`, row by row, in the image's own unit. Whole numbers and booleans become the default float type.
+        spacing: distance between neighbouring pixels `(along x, along y)` [m, or whatever length the node positions are in].
+        origin: position `(x, y)` of pixel `values[0, 0]`, in the same unit.
+
+    Raises:
+        ValueError: no pixels, not two axes, a pixel that is NaN or infinite, a spacing that is not positive.
+            Of traced values only shape and type are looked at.
+        TypeError: complex, text or half-precision pixels.
+
+    >>> import numpy as np
+    >>> image = Image(np.array([[0.0, 1.0], [10.0, 11.0]]))
+    >>> print(image.sample(1.0, 0.5))
+    6.0
+    """
+
+    values: Array
+    spacing: tuple[Array, Array]
+    origin: tuple[Array, Array]
+
+    def __init__(self, values: ArrayLike, spacing: PerAxis = 1.0, origin: PerAxis = 0.0):
+        self.values = _as_pixels(values)
+        self.spacing = _per_axis("spacing", spacing, self.values.dtype, must_be_positive=True)
+        self.origin = _per_axis("origin", origin, self.values.dtype)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns `(ny, nx)`."""
+        ny, nx = jnp.shape(self.values)[-2:]
+        return ny, nx
+
+    @property
+    def dtype(self) -> jnp.dtype:
+        """Floating type of the pixels."""
+        return jnp.result_type(self.values)
+
+    def with_values(self, values: Array) -> Image:
+        """The same geometry and floating type with other pixels `(ny, nx)`; their values are not checked."""
+        if jnp.shape(values) != jnp.shape(self.values):
+            raise ValueError(f"values has shape {jnp.shape(values)}, but the image has {jnp.shape(self.values)}: pass one value per pixel.")
+        return eqx.tree_at(lambda image: image.values, self, jnp.asarray(values, self.dtype))
+
+    def normalised(self) -> Image:
+        """Pixels scaled to [0, 1] by their whole range; a constant image becomes 0."""
+        low, high = jnp.min(self.values), jnp.max(self.values)
+        extent = jnp.where(high > low, high - low, 1)
+        return self.with_values((self.values - low) / extent)
+
+    def surface(self, method: Sampling = Bilinear()) -> Surface:  # noqa: B008 (frozen, holds no array)
+        """The image made ready to be read between its pixels. Make it once, outside a loop: `CubicSpline` filters the pixels here."""
+        return Surface(method.coefficients(self.values), self.spacing, self.origin, self.shape, method)
+
+    def sample(self, x: ArrayLike, y: ArrayLike, method: Sampling = Bilinear()) -> Array:  # noqa: B008
+        """Values at the points `(x, y)`; see `Surface.value`."""
+        return self.surface(method).value(x, y)
+
+    def sample_with_gradient(self, x: ArrayLike, y: ArrayLike, method: Sampling = Bilinear()) -> tuple[Array, Array, Array]:  # noqa: B008
+        """Values and both slopes at the points `(x, y)`; see `Surface.value_and_gradient`."""
+        return self.surface(method).value_and_gradient(x, y)
+
+    def outside(self, x: ArrayLike, y: ArrayLike) -> Array:
+        """Which points lie outside the outermost pixels, as booleans of the points' shape; see `Surface.outside`."""
+        return self.surface().outside(x, y)
+
+
+def _per_axis(name: str, value: PerAxis, dtype: jnp.dtype, must_be_positive: bool = False) -> tuple[Array, Array]:
+    """A number, or a pair (x, y), as two scalar arrays of the pixels' type."""
+    pair: tuple[Any, ...] = (value, value) if isinstance(value, (int, float)) or np.ndim(value) == 0 else tuple(value)
+    if len(pair) != 2 or any(np.ndim(part) for part in pair):
+        raise ValueError(f"{name} must be one number or a pair (along x, along y), got {value!r}.")
+    for axis, part in zip("xy", pair, strict=True):
+        if not isinstance(part, Tracer) and not (np.isfinite(part) and (part > 0 or not must_be_positive)):
+            wanted = "positive and finite" if must_be_positive else "finite"
+            raise ValueError(f"{name} along {axis} is {part}, but must be {wanted}: every sample would be wrong. Correct {name}.")
+    return jnp.asarray(pair[0], dtype), jnp.asarray(pair[1], dtype)
+
+
+def _as_pixels(values: ArrayLike) -> Array:
+    """Pixels as a floating array; refuse what is not one channel of finite real numbers, naming what came and what to do."""
+    array = values if isinstance(values, Tracer) else np.asarray(values)
+    dtype = _floating(np.dtype(array.dtype))
+    shape = tuple(array.shape)
+    if len(shape) != 2:
+        is_colour = len(shape) == 3 and shape[-1] in (1, 2, 3, 4)
+        cure = "pass values[..., 0], or load it with channel=Luminance()" if is_colour else "pass an array (rows, columns)"
+        raise ValueError(f"values has shape {shape}, but an image has one channel, (ny, nx): {cure}.")
+    if 0 in shape:
+        raise ValueError(f"values has shape {shape}: there is no pixel to sample. Pass at least one row and one column.")
+    if isinstance(array, np.ndarray):
+        # Converted here and not by JAX, which knows neither foreign byte orders nor long doubles; what overflows is found below.
+        with np.errstate(over="ignore"):
+            array = array.astype(dtype)
+        bad = np.argwhere(~np.isfinite(array))
+        if len(bad):
+            row, column = (int(i) for i in bad[0])
+            raise ValueError(
+                f"values[{row}, {column}] is {array[row, column]} in {dtype} ({len(bad)} of {array.size} pixels are not finite).\n"
+                "Unchecked, it would spoil every sample in the four cells around it, even exactly on a good neighbour (0 * NaN is NaN).\n"
+                "Repair the pixels, or load them with fill=<number> to replace each one that is not finite."
+            )
+    return jnp.asarray(array, dtype)
+
+
+def _floating(dtype: np.dtype[Any]) -> np.dtype[Any]:
+    """The floating type that pixels of `dtype` are held in."""
+    if dtype.kind in "biu":
+        return jnp.result_type(float)
+    if not jnp.issubdtype(dtype, jnp.floating):
+        raise TypeError(f"values has dtype {dtype}, but pixels must be real numbers. Pass for instance their absolute value.")
+    if dtype.itemsize < 4:
+        raise TypeError(f"values has dtype {dtype}: half precision overflows in the filters. Convert with values.astype('float32').")
+    return np.dtype(np.float32) if dtype.itemsize == 4 else jnp.result_type(float)

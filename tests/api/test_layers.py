@@ -1,0 +1,86 @@
+"""The library is a stack of layers, and imports go down only."""
+
+import graphlib
+
+import pytest
+
+from tests import source
+
+# One layer per module or package right under jaxspring/. A module may import its own layer and those below.
+LAYERS = {
+    "_version": 0,
+    "_checks": 0,
+    "numerics": 0,
+    "status": 0,
+    "vector": 0,
+    "topology": 1,
+    "images": 1,
+    "linalg": 2,
+    "state": 2,  # a topology and its node fields; forces read it
+    "forces": 3,
+    "thermal": 3,
+    "system": 4,
+    "stability": 4,
+    "steppers": 5,
+    "equilibrium": 5,
+    "rollout": 6,
+    "ode": 6,
+    "inverse": 7,
+    "study": 7,
+    "scenes": 8,
+    "cli": 8,
+    "__main__": 9,
+    "__init__": 9,  # the public names
+}
+# Third-party packages that any module may load; the rest waits inside the function that needs it.
+EVERYWHERE = {"jax", "numpy", "equinox", "jaxtyping"}
+# Packages kept to certain places, at the top of the file or inside a function.
+CONFINED = {
+    "diffrax": {"ode"},
+    "optax": {"inverse"},
+    "optimistix": {"inverse", "equilibrium"},
+    "lineax": {"linalg", "steppers", "equilibrium", "inverse"},
+}
+
+
+def unit(name: str) -> str:
+    """The part of a dotted name that has a layer: `forces` for `jaxspring.forces.springs`."""
+    return [*name.split("."), "__init__"][1]
+
+
+@pytest.mark.parametrize("path", source.files(), ids=source.module_name)
+def test_imports_go_down(path):
+    """A module imports its own layer or a lower one; so does a function inside it."""
+    here = unit(source.module_name(path))
+    assert here in LAYERS, f"{path.name}: jaxspring/{here} has no layer. Give it one in tests/api/test_layers.py."
+    upward = [
+        f"line {line}: {name}"
+        for name, line, _ in source.imports(path)
+        if name.split(".")[0] == "jaxspring" and LAYERS.get(unit(name), 99) > LAYERS[here]
+    ]
+    assert not upward, f"{source.module_name(path)} (layer {LAYERS[here]}) imports from above: {'; '.join(upward)}"
+
+
+def test_no_import_cycle():
+    """Some order of loading exists in which every module comes after all that it imports, early or late."""
+    graph = {source.module_name(path): {name for name, _, _ in source.imports(path) if "jaxspring." in name} for path in source.files()}
+    try:
+        list(graphlib.TopologicalSorter(graph).static_order())
+    except graphlib.CycleError as error:
+        pytest.fail("an import cycle: " + " -> ".join(error.args[1]))
+
+
+@pytest.mark.parametrize("path", source.files(), ids=source.module_name)
+def test_heavy_packages_are_loaded_late_and_in_their_place(path):
+    """A file loads few packages; optional and heavy ones wait inside a function, and some belong to one layer."""
+    here = unit(source.module_name(path))
+    at_home = {package for package, places in CONFINED.items() if here in places}
+    allowed_early = source.STANDARD | EVERYWHERE | at_home | {"jaxspring"}
+    wrong = []
+    for name, line, early in source.imports(path):
+        package = name.split(".")[0]
+        if package in CONFINED and package not in at_home:
+            wrong.append(f"line {line}: {package} belongs to {' or '.join(sorted(CONFINED[package]))}")
+        elif early and package not in allowed_early:
+            wrong.append(f"line {line}: import {package} inside the function that needs it")
+    assert not wrong, f"{source.module_name(path)}: {'; '.join(wrong)}"

@@ -60,7 +60,7 @@ def silent_methods(cls: type) -> list[str]:
     for name in dir(cls):
         member = getattr(cls, name, None)
         function = inspect.unwrap(getattr(member, "fget", member))
-        ours = inspect.isroutine(function) and (function.__module__ or "").startswith("jaxspring")
+        ours = inspect.isroutine(function) and (getattr(function, "__module__", None) or "").startswith("jaxspring")
         if ours and not name.startswith("_") and not inspect.getdoc(member):
             found.append(name)
     return found

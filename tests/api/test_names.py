@@ -68,7 +68,7 @@ def silent_methods(cls: type) -> list[str]:
 
 def written(thing: object, name: str) -> bool:
     """Whether there is a docstring that somebody wrote: a dataclass without one is given `Name(field: type)`."""
-    text = vars(thing).get("__doc__") or ""
+    text = thing.__doc__ or ""
     return bool(text.strip()) and not text.startswith(f"{name}(")
 
 

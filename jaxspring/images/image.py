@@ -96,7 +96,7 @@ class Image(eqx.Module):
 
 def _per_axis(name: str, value: PerAxis, dtype: jnp.dtype, must_be_positive: bool = False) -> tuple[Array, Array]:
     """A number, or a pair (x, y), as two scalar arrays of the pixels' type."""
-    pair: tuple[Any, ...] = (value, value) if isinstance(value, (int, float)) or np.ndim(value) == 0 else tuple(value)
+    pair: tuple[Any, ...] = tuple(value) if isinstance(value, (tuple, list)) or np.ndim(value) == 1 else (value, value)
     if len(pair) != 2 or any(np.ndim(part) for part in pair):
         raise ValueError(f"{name} must be one number or a pair (along x, along y), got {value!r}.")
     for axis, part in zip("xy", pair, strict=True):

@@ -18,6 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .filtering import band_distance, filter_axis
+
 # The inverse of the sampled cubic B-spline (1, 4, 1)/6 is sqrt(3) z^|k|, with z the root of z^2 + 4 z + 1 inside the unit circle.
 _POLE = float(np.sqrt(3.0) - 2.0)
 
@@ -101,24 +103,6 @@ def _prefilter(values: Array, axis: int) -> Array:
         return values
     # Cut where the tail is under a tenth of the rounding unit: 14 taps on each side in float32, 30 in float64.
     radius = int(np.ceil(np.log(0.1 * float(jnp.finfo(values.dtype).eps)) / np.log(-_POLE)))
-    taps = np.sqrt(3.0) * _POLE ** np.arange(radius + 1)
-    return correlate_symmetric(values, [float(tap) for tap in taps], axis, mode="reflect")
-
-
-def correlate_symmetric(values: Array, taps: list, axis: int, *, mode: str) -> Array:
-    """Filter one axis with the symmetric kernel `taps[|k|]`, by shifted slices of the image extended by `jnp.pad`'s `mode`.
-
-    Shifted slices fuse into one vector loop: 40 times faster than a convolution on the CPU.
-    """
-    n, radius = values.shape[axis], len(taps) - 1
-    widths = [(0, 0), (0, 0)]
-    widths[axis] = (radius, radius)
-    padded = jnp.pad(values, widths, mode=mode)
-
-    def shifted(k: int) -> Array:
-        return padded[k : k + n] if axis == 0 else padded[:, k : k + n]
-
-    total = taps[0] * shifted(radius)
-    for k in range(1, radius + 1):
-        total = total + taps[k] * (shifted(radius - k) + shifted(radius + k))
-    return total
+    distance = band_distance(radius)
+    band = np.where(distance <= radius, np.sqrt(3.0) * _POLE**distance, 0.0)
+    return filter_axis(values, jnp.asarray(band, values.dtype), radius, axis, mode="reflect")

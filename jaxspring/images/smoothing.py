@@ -10,11 +10,12 @@ from __future__ import annotations
 import math
 
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
+from .filtering import band_distance, filter_axis
 from .image import Image
-from .sampling import correlate_symmetric
 
 Length = float | Array
 
@@ -57,8 +58,7 @@ def smooth(image: Image, sigma: Length, radius: int | None = None) -> Image:
     values = image.values
     for axis, spacing in ((1, image.spacing[0]), (0, image.spacing[1])):
         if values.shape[axis] > 1:
-            taps = _gaussian_taps(sigma / spacing, radius)
-            values = correlate_symmetric(values, [taps[k] for k in range(radius + 1)], axis, mode="symmetric")
+            values = filter_axis(values, _gaussian_band(sigma / spacing, radius), radius, axis, mode="symmetric")
     return image.with_values(values)
 
 
@@ -76,15 +76,18 @@ def smoothing_radius(sigma: Length, spacing: Length | tuple[Length, Length] = 1.
     return math.ceil(deviations * sigma / finest * (1 - 1e-6))
 
 
-def _gaussian_taps(deviation: Array, radius: int) -> Array:
-    """Half kernel `(radius + 1,)` for a deviation in pixels: the whole kernel sums to one."""
+def _gaussian_band(deviation: Array, radius: int) -> Array:
+    """Band matrix of the Gaussian whose standard deviation is given in pixels; the kernel sums to one."""
     square = jnp.square(deviation)
     is_wide = square > _IDENTITY_DEVIATION**2
     exponent = 0.5 / jnp.where(is_wide, square, _IDENTITY_DEVIATION**2)
-    distance = jnp.arange(radius + 1, dtype=deviation.dtype)
-    weights = jnp.where(is_wide | (distance == 0), jnp.exp(-jnp.square(distance) * exponent), 0)
-    taps = weights / (2 * jnp.sum(weights) - weights[0])
-    return jnp.where(2 * jnp.abs(deviation) <= radius * (1 + 1e-5), taps, jnp.nan)
+
+    def weight(distance: np.ndarray) -> Array:
+        is_kept = (distance == 0) | (is_wide & (distance <= radius))
+        return jnp.where(is_kept, jnp.exp(-exponent * np.square(distance).astype(deviation.dtype)), 0)
+
+    band = weight(band_distance(radius)) / jnp.sum(weight(np.arange(-radius, radius + 1)))
+    return jnp.where(2 * jnp.abs(deviation) <= radius * (1 + 1e-5), band, jnp.nan)
 
 
 def _check_radius(radius: int) -> None:

@@ -1,0 +1,52 @@
+"""Differentiable mass-spring physics on JAX: springs, damping, data springs to images, adaptive meshes.
+
+Every public name is loaded on first use, so that `import jaxspring` costs little more than `import jax`.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+from ._version import __version__
+
+_HOMES = {
+    "vector": ("Vector",),
+    "status": ("Flag", "SimulationError", "StabilityWarning", "Status", "raise_for_status"),
+    "state": ("State",),
+    "system": ("Energy", "Motion", "System", "lumped_mass"),
+    "rollout": ("Result", "Resume", "rollout"),
+    "blocks": ("Checkpointed", "StoreAll"),
+    "progress": ("Progress",),
+    "topology.edge_field": ("EdgeField",),
+    "topology.base": ("Topology",),
+    "topology.lattice": ("BEND", "BODY", "SHEAR", "STRUCTURAL", "Lattice", "lattice"),
+    "topology.graph": ("Graph",),
+    "topology.reduction": ("Gather", "Scatter"),
+    "forces.base": ("Finding", "Force"),
+    "forces.laws": ("EnergyLaw", "Hooke", "Law", "PowerLaw", "PullLaw", "TensionOnly"),
+    "forces.springs": ("Springs", "StiffnessRule"),
+    "forces.adaptive": ("ImageStiffness",),
+    "forces.damping": ("Dashpots", "Drag"),
+    "forces.loads": ("Gravity", "Load"),
+    "forces.data_springs": ("DataSprings", "ImageAttraction"),
+    "steppers.base": ("Stepper",),
+    "steppers.explicit": ("ForwardEuler", "RungeKutta4", "SymplecticEuler", "VelocityVerlet"),
+    "steppers.stability": ("stable_dt",),
+}
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+
+__all__ = ["__version__", *sorted(_HOME_OF)]
+
+
+def __getattr__(name: str) -> Any:
+    home = _HOME_OF.get(name)
+    if home is None:
+        raise AttributeError(f"module 'jaxspring' has no attribute {name!r}")
+    value = getattr(importlib.import_module(f".{home}", __name__), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_HOME_OF])

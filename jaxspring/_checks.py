@@ -1,0 +1,123 @@
+"""Checks made once, on the host, when an object is built.
+
+JAX clamps a bad index, drops it in a scatter, and gives it gradient zero, all without a word; a NaN spreads. So every
+constructor looks at its input first and names the field, the index, what was expected and what to do. A traced value (inside
+`jit`, `grad` or `vmap`) cannot be looked at: then only its shape and dtype are checked, and its value at step 0, by status.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+
+def shape_of(value: Any) -> tuple[int, ...]:
+    """Shape of an array, a tracer, a number or a shape struct."""
+    return tuple(np.shape(value)) if not hasattr(value, "shape") else tuple(value.shape)
+
+
+def is_concrete(value: Any) -> bool:
+    """Whether the numbers in `value` can be looked at now."""
+    return isinstance(value, (bool, int, float, np.ndarray, np.generic, list, tuple)) or (
+        isinstance(value, jax.Array) and not isinstance(value, jax.core.Tracer)
+    )
+
+
+def as_inexact(name: str, value: Any, dtype: Any = None) -> Array:
+    """`value` as a float32 or float64 array: integers are converted, half precision and complex numbers refused."""
+    if isinstance(value, (list, tuple)):
+        value = np.asarray(value)
+    kind = jnp.result_type(value)
+    if kind == jnp.bool_ or not (jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer)):
+        raise TypeError(f"{name} has dtype {kind}; expected real numbers. Convert it, e.g. {name}.astype(float).")
+    if jnp.issubdtype(kind, jnp.floating) and jnp.finfo(kind).bits < 32:
+        raise TypeError(
+            f"{name} has dtype {kind}: half precision holds 3 digits, too few for a difference of positions. "
+            f"Use float32 or float64, e.g. {name}.astype('float32')."
+        )
+    if dtype is None:
+        dtype = kind if jnp.issubdtype(kind, jnp.floating) else jnp.result_type(float)
+    return jnp.asarray(value, jax.dtypes.canonicalize_dtype(dtype))
+
+
+def finite(name: str, value: Any) -> None:
+    """Raise ValueError naming the first NaN or infinity in `value`."""
+    if not is_concrete(value):
+        return
+    numbers = np.asarray(value)
+    bad = ~np.isfinite(numbers)
+    if bad.any():
+        where, shown = _first(bad, numbers)
+        raise ValueError(
+            f"{name}{where} = {shown}, but must be finite. Unchecked, it would spread to every node it can reach. "
+            f"Fix {name}{where} ({int(bad.sum())} of {numbers.size} values are not finite)."
+        )
+
+
+def positive(name: str, value: Any, why: str) -> None:
+    """Raise ValueError naming the first number that is not above zero."""
+    _sign(name, value, why, strict=True)
+
+
+def nonnegative(name: str, value: Any, why: str) -> None:
+    """Raise ValueError naming the first number below zero."""
+    _sign(name, value, why, strict=False)
+
+
+def _sign(name: str, value: Any, why: str, *, strict: bool) -> None:
+    if not is_concrete(value):
+        return
+    finite(name, value)
+    numbers = np.asarray(value)
+    bad = numbers <= 0 if strict else numbers < 0
+    if bad.any():
+        where, shown = _first(bad, numbers)
+        expected = "positive" if strict else "zero or more"
+        raise ValueError(f"{name}{where} = {shown}, but must be {expected}. {why} Fix {name}{where}.")
+
+
+def has_shape(name: str, value: Any, allowed: dict[str, tuple[int, ...]]) -> None:
+    """Raise ValueError unless the shape of `value` is one of `allowed` (a table of meaning -> shape)."""
+    shape = shape_of(value)
+    if shape not in allowed.values():
+        listed = ", or ".join(f"{expected} ({meaning})" for meaning, expected in allowed.items())
+        raise ValueError(f"{name} has shape {shape}; expected {listed}.")
+
+
+def node_indices(name: str, edges: Any, n_nodes: int) -> np.ndarray:
+    """`edges` as an (E, 2) integer array whose every entry names a node 0 ... n_nodes - 1."""
+    array = np.asarray(edges)
+    if array.size == 0:
+        return np.zeros((0, 2), np.int32)
+    if array.dtype == np.bool_ or not np.issubdtype(array.dtype, np.integer):
+        raise TypeError(f"{name} has dtype {array.dtype}; expected integer node numbers. JAX would read a bool as a mask.")
+    if array.ndim != 2 or array.shape[1] != 2:
+        raise ValueError(f"{name} has shape {array.shape}; expected (E, 2): tail and head node of each spring.")
+    bad = (array < 0) | (array >= n_nodes)
+    if bad.any():
+        spring, end = (int(i) for i in np.argwhere(bad)[0])
+        pair = tuple(int(i) for i in array[spring])
+        node = pair[end]
+        raise ValueError(
+            f"{name}[{spring}] = {pair} names node {node}, but there are n_nodes = {n_nodes} (nodes are 0 to {n_nodes - 1}).\n"
+            f"Unchecked, JAX would read another node instead and drop the pull on node {node}, without a word.\n"
+            f"Fix {name}[{spring}]" + (f", or pass n_nodes={node + 1} if node {node} exists." if node >= 0 else ".")
+        )
+    loops = array[:, 0] == array[:, 1]
+    if loops.any():
+        spring = int(np.argmax(loops))
+        raise ValueError(
+            f"{name}[{spring}]: spring {spring} joins node {int(array[spring, 0])} to itself. Its length is always 0 and its "
+            f"direction undefined. Remove {name}[{spring}]."
+        )
+    return array.astype(np.int32)
+
+
+def _first(bad: np.ndarray, numbers: np.ndarray) -> tuple[str, str]:
+    index = tuple(int(i) for i in np.argwhere(bad)[0])
+    where = "" if not index else "[" + ", ".join(map(str, index)) + "]"
+    return where, str(numbers[index])

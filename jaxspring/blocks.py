@@ -1,0 +1,186 @@
+"""How a run of T steps is cut: blocks of about sqrt(T) steps, so that reverse mode remembers about 2 sqrt(T) states.
+
+    few frames    frame = blocks of b steps              frames x scan(blocks) x scan(steps)
+    many frames   block = g frames of s steps each       scan(blocks) x scan(frames) x scan(steps)
+
+A block and a step inside it are rematerialised: the backward pass runs each block forward once more.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from .state import State
+from .watch import Carry, Watch
+
+Pair = tuple[Carry, Watch]
+
+
+class Checkpointed(eqx.Module):
+    """Reverse mode in O(sqrt T) memory, for one more forward run. The default.
+
+    Attributes:
+        block: steps in a block; None takes about sqrt(n_steps).
+    """
+
+    block: int | None = eqx.field(static=True, default=None)
+
+
+class StoreAll(eqx.Module):
+    """Reverse mode that stores every state: O(T) memory, no second forward run."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How a run is cut.
+
+    Attributes:
+        n_steps: T.
+        save_every: steps s in a frame, or None for no frames.
+        block: steps b in a block (few frames).
+        group: frames g in a block (many frames), or 0.
+        rematerialise: whether reverse mode runs blocks again instead of storing their states.
+        check_every: look for trouble every so many steps; None is once per block.
+    """
+
+    n_steps: int
+    save_every: int | None
+    block: int
+    group: int
+    rematerialise: bool
+    check_every: int | None
+
+    @property
+    def unit(self) -> int:
+        """Steps that a chunk of this run must hold whole."""
+        if self.save_every is None:
+            return self.block
+        return self.save_every * max(self.group, 1)
+
+    def pieces(self, n_pieces: int) -> list[Plan]:
+        """The same run as consecutive runs of whole units, about `n_pieces` of equal length, so that they share one compile."""
+        units = self.n_steps // self.unit
+        if units < 2 or n_pieces < 2:
+            return [self]
+        each = max(units // n_pieces, 1) * self.unit
+        lengths = [each] * (self.n_steps // each)
+        rest = self.n_steps - each * len(lengths)
+        return [replace(self, n_steps=n) for n in lengths + [rest] * bool(rest)]
+
+
+def make_plan(n_steps: int, save_every: int | None, adjoint: Checkpointed | StoreAll, check_every: int | None) -> Plan:
+    """Cut a run of `n_steps`, frames after every `save_every`."""
+    remat = isinstance(adjoint, Checkpointed)
+    wanted = adjoint.block if isinstance(adjoint, Checkpointed) and adjoint.block else max(round(math.sqrt(n_steps)), 1)
+    if save_every is None:
+        return Plan(n_steps, None, _near_divisor(n_steps, wanted), 0, remat, check_every)
+    if save_every >= wanted:
+        return Plan(n_steps, save_every, _near_divisor(save_every, wanted), 0, remat, check_every)
+    group = _near_divisor(n_steps // save_every, max(round(wanted / save_every), 1))
+    return Plan(n_steps, save_every, save_every, group, remat, check_every)
+
+
+def run_blocks(
+    advance: Callable[[Carry], Carry],
+    inspect: Callable[[Carry, Carry, Watch], Watch],
+    keep: Callable[[State], Any],
+    report: Callable[[Carry], None],
+    pair: Pair,
+    plan: Plan,
+) -> tuple[Pair, Any]:
+    """Run the plan; returns the last carry, the watch, and the kept frames (None without)."""
+    steps = _stepping(advance, inspect, plan)
+
+    def block(pair: Pair, n: int) -> Pair:
+        before = pair[0]
+        carry, watch = _remat(lambda p: steps(p, n), plan)(pair)
+        return _seen((carry, watch), before)
+
+    def _seen(pair: Pair, before: Carry) -> Pair:
+        carry, watch = pair
+        report(carry)
+        return carry, watch if plan.check_every else inspect(before, carry, watch)
+
+    def stretch(pair: Pair, n: int) -> Pair:
+        """N steps, in blocks."""
+        whole, rest = divmod(n, plan.block)
+        if whole == 1:
+            pair = block(pair, plan.block)
+        elif whole:
+            pair, _ = lax.scan(lambda p, _: (block(p, plan.block), None), pair, None, length=whole)
+        return block(pair, rest) if rest else pair
+
+    if plan.save_every is None:
+        return stretch(pair, plan.n_steps), None
+    every = plan.save_every
+    n_frames = plan.n_steps // every
+    if not plan.group:
+
+        def frame(pair: Pair, _: None) -> tuple[Pair, Any]:
+            pair = stretch(pair, every)
+            return pair, keep(pair[0].state)
+
+        return lax.scan(frame, pair, None, length=n_frames)
+
+    def group(pair: Pair, n: int) -> tuple[Pair, Any]:
+        def frames(pair: Pair) -> tuple[Pair, Any]:
+            def frame(pair: Pair, _: None) -> tuple[Pair, Any]:
+                pair = steps(pair, every)
+                return pair, keep(pair[0].state)
+
+            return lax.scan(frame, pair, None, length=n)
+
+        after, saved = _remat(frames, plan)(pair)
+        return _seen(after, pair[0]), saved
+
+    whole, rest = divmod(n_frames, plan.group)
+    pair, saved = lax.scan(lambda p, _: group(p, plan.group), pair, None, length=whole)
+    saved = jax.tree.map(lambda a: a.reshape(whole * plan.group, *a.shape[2:]), saved)
+    if rest:
+        pair, last = group(pair, rest)
+        saved = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), saved, last)
+    return pair, saved
+
+
+def _stepping(
+    advance: Callable[[Carry], Carry], inspect: Callable[[Carry, Carry, Watch], Watch], plan: Plan
+) -> Callable[[Pair, int], Pair]:
+    def one(pair: Pair, _: None) -> tuple[Pair, None]:
+        before, watch = pair
+        after = advance(before)
+        if plan.check_every:
+            due = after.step % plan.check_every == 0
+            watch = lax.cond(due, lambda w: inspect(before, after, w), lambda w: w, watch)
+        return (after, watch), None
+
+    step = jax.checkpoint(one, prevent_cse=False) if plan.rematerialise else one
+
+    def steps(pair: Pair, n: int) -> Pair:
+        if n == 1:
+            return step(pair, None)[0]
+        if plan.check_every:
+            return lax.scan(step, pair, None, length=n)[0]
+        carry, watch = pair
+        carry, _ = lax.scan(lambda c, _: (step((c, watch), None)[0][0], None), carry, None, length=n)
+        return carry, watch
+
+    return steps
+
+
+def _remat(function: Callable[[Pair], Any], plan: Plan) -> Callable[[Pair], Any]:
+    return jax.checkpoint(function, prevent_cse=False) if plan.rematerialise else function
+
+
+def _near_divisor(n: int, wanted: int) -> int:
+    """A divisor of n within a factor of two of `wanted`, the nearest one; else `wanted` itself (the last block is then shorter)."""
+    wanted = min(max(wanted, 1), max(n, 1))
+    fitting = [d for d in range(max(wanted // 2, 1), 2 * wanted + 1) if n % d == 0]
+    return min(fitting, key=lambda d: abs(d - wanted)) if fitting else wanted

@@ -1,0 +1,82 @@
+"""What a force is: a function of the state, with what the system may ask of it.
+
+Write your own by subclassing `Force`: `force` alone is enough. `energy` closes the ledger, `stiffness_bound` serves `stable_dt`, and
+`diagnose` tells what it saw when the status is taken.
+"""
+
+from __future__ import annotations
+
+import abc
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ..numerics import cast_inexact
+from ..state import State
+from ..status import Flag
+from ..vector import Vector
+
+
+class Finding(eqx.Module):
+    """Something an effect has to report about a state.
+
+    Attributes:
+        flag: which kind of trouble (static).
+        count: how many nodes or springs show it; 0 is none.
+        node: flat index of the first of them, -1 where it is a spring.
+    """
+
+    flag: Flag = eqx.field(static=True)
+    count: Array
+    node: Array
+
+
+class Force(eqx.Module):
+    """A force on the nodes. Abstract; `Springs`, `Drag`, `Gravity` and the others are final."""
+
+    @abc.abstractmethod
+    def force(self, state: State) -> Vector:
+        """Force on each node [N], in node shape."""
+
+    def energy(self, state: State) -> Array | None:
+        """Potential energy [J], or None where the force has no potential."""
+        return None
+
+    def prepare(self, dtype: Any) -> Force:
+        """The same force with every constant in the shape and dtype that the loop wants. Called once, before the loop."""
+        return cast_inexact(self, dtype)
+
+    def with_mass(self, mass: Array) -> Force:
+        """The force acting on these node masses [kg]; only forces that need them answer with another object."""
+        return self
+
+    def stiffness_bound(self, state: State) -> Array | None:
+        """Upper bound of the row sums of |dF/dx| at each node [N/m], in node shape or a number; None where zero."""
+        return None
+
+    def damping_bound(self, state: State) -> Array | None:
+        """Upper bound of the row sums of |dF/dv| at each node [N s/m]; None where zero."""
+        return None
+
+    def damping_floor(self, state: State) -> Array | None:
+        """Lower bound of -dF/dv on every motion of a node [N s/m]; None where zero."""
+        return None
+
+    def diagnose(self, state: State) -> tuple[Finding, ...]:
+        """What this effect has to report about a state: see `Finding`."""
+        return ()
+
+    def invalid(self) -> Array | None:
+        """Whether a constant has a value that the constructor would refuse (for values that were traced then, or changed since)."""
+        return None
+
+
+def any_negative_or_nan(*values: Any) -> Array:
+    """True where any entry of any array is negative or NaN."""
+    bad = jnp.zeros((), bool)
+    for leaf in jax.tree.leaves(values):
+        bad = bad | ~jnp.all(leaf >= 0)
+    return bad

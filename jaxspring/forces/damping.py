@@ -1,0 +1,107 @@
+"""Damping: drag against the surroundings, and dashpots along springs.
+
+    drag      f_i = -gamma_i v_i                                   [N]   slows rigid motion too
+    dashpot   f_i = c_ij ((v_j - v_i) . u_ij) u_ij                 [N]   keeps momentum and angular momentum
+
+Source: slide "Force Computation (Cont.)" for the drag; the dashpot is the usual damper along the spring (absent from the slides).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._checks import as_inexact, nonnegative
+from ..numerics import cast_inexact, tiny
+from ..state import State
+from ..topology.base import Topology
+from ..topology.edge_field import EdgeField
+from ..vector import Vector
+from .base import Force, any_negative_or_nan
+from .springs import _check_sign, _edge_constant
+
+
+class Drag(Force):
+    """Viscous drag on every node.
+
+    Attributes:
+        gamma: [N s/m], one number, or a node array in node shape (make it with `net.node_field`).
+
+    Raises:
+        ValueError: a negative or non-finite value.
+    """
+
+    gamma: Array
+
+    def __init__(self, gamma: Any):
+        self.gamma = as_inexact("gamma", gamma)
+        nonnegative("gamma", self.gamma, "A negative drag feeds energy in.")
+
+    def force(self, state: State) -> Vector:
+        """-gamma v [N]."""
+        return -(self.gamma * state.velocity)
+
+    def damping_bound(self, state: State) -> Array:
+        """Gamma [N s/m]."""
+        return self.gamma.astype(state.dtype)
+
+    def damping_floor(self, state: State) -> Array:
+        """Gamma [N s/m]."""
+        return self.gamma.astype(state.dtype)
+
+    def invalid(self) -> Array:
+        """Whether gamma is negative or NaN."""
+        return any_negative_or_nan(self.gamma)
+
+
+class Dashpots(Force):
+    """A damper along every spring of a network.
+
+    Attributes:
+        net: the topology.
+        damping: c [N s/m]: a number, (E,) in the user's order, or an `EdgeField`.
+    """
+
+    net: Topology
+    damping: Any
+
+    def __init__(self, net: Topology, damping: Any):
+        self.net = net
+        self.damping = _edge_constant(net, "damping", damping)
+        _check_sign("damping", self.damping, "A negative damper feeds energy in.")
+
+    def prepare(self, dtype: Any) -> Dashpots:
+        """Constants as edge fields of `dtype`."""
+        return cast_inexact(eqx.tree_at(lambda f: f.damping, self, self.net.edge_field(self.damping)), dtype)
+
+    def force(self, state: State) -> Vector:
+        """Sum of the dampers' pulls at each node [N]; a spring of no length has no direction and no damping."""
+        if self.net.n_springs == 0:
+            return Vector.zeros_like(state.position)
+
+        def pull(d: Vector, relative: Vector, c: Array) -> Vector:
+            return (c * d.dot(relative) / jnp.maximum(d.dot(d), tiny(d.dtype))) * d
+
+        d = self.net.difference(state.position)
+        pulls = self.net.map_springs(pull, d, self._rate(state), self.net.edge_field(self.damping))
+        return self.net.accumulate(pulls)
+
+    def damping_bound(self, state: State) -> Array | None:
+        """Twice the sum of the dampers at each node [N s/m]."""
+        if self.net.n_springs == 0:
+            return None
+        c = self.net.edge_field(self.damping)
+        spread = EdgeField(tuple(jnp.ones(shape, state.dtype) for shape in self.net.family_shapes))
+        return 2 * self.net.incident_sum(self.net.map_springs(lambda one, c: one * c, spread, c))
+
+    def invalid(self) -> Array:
+        """Whether a damper is negative or NaN."""
+        return any_negative_or_nan(self.damping)
+
+    def _rate(self, state: State) -> EdgeField:
+        # A velocity is a difference of neighbouring images: it is never wrapped by a period.
+        unboxed = eqx.tree_at(lambda n: n.box, self.net, None, is_leaf=lambda leaf: leaf is None)
+        return unboxed.difference(state.velocity)

@@ -1,0 +1,146 @@
+"""Data springs: the image pulls the mesh.
+
+    DataSprings       f_i = (0, 0, k_data (d(x_i, y_i) - z_i))     the slides' law: z toward the image value under the node   [N]
+    ImageAttraction   f_i = strength grad d(x_i, y_i)              the image as a potential, -strength d                      [N]
+
+The slide prints the first as a norm; its code (`force.z += IMAGE_CONST * (val - p.z)`) is what is meant. That law pulls z alone, so its
+Jacobian is not symmetric where the image has a slope, and it has no potential. `conservative=True` adds the missing in-plane part,
+-k e grad d with e = d - z, which makes it the gradient of k/2 e^2.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._checks import as_inexact, nonnegative
+from ..images.image import Image
+from ..images.sampling import Bilinear
+from ..images.surface import Surface
+from ..numerics import cast_inexact
+from ..state import State
+from ..status import Flag
+from ..vector import Vector
+from .base import Finding, Force, any_negative_or_nan
+
+
+class DataSprings(Force):
+    """A spring from every node to the image surface above or below it, along z.
+
+    Attributes:
+        image: the data d(x, y); its values have the unit of z [m].
+        stiffness: k_data [N/m], one number or a node array.
+        sampling: how the image is read between pixels.
+        conservative: add the in-plane part that makes the force the gradient of an energy.
+    """
+
+    image: Image | Surface
+    stiffness: Array
+    sampling: Any
+    conservative: bool = eqx.field(static=True)
+
+    def __init__(self, image: Image, stiffness: Any, sampling: Any = None, conservative: bool = False):
+        self.image = image
+        self.stiffness = as_inexact("stiffness", stiffness)
+        self.sampling = Bilinear() if sampling is None else sampling
+        self.conservative = conservative
+        nonnegative("stiffness", self.stiffness, "A negative data spring pushes away from the image.")
+
+    def prepare(self, dtype: Any) -> DataSprings:
+        """The image ready to be read, constants of `dtype`."""
+        return _prepared(self, dtype)
+
+    def force(self, state: State) -> Vector:
+        """Pull toward the image [N]."""
+        x, y, z = _coordinates(state)
+        if not self.conservative:
+            zero = jnp.zeros_like(z)
+            return Vector((zero, zero, self.stiffness * (_surface(self).value(x, y) - z)))
+        value, dx, dy = _surface(self).value_and_gradient(x, y)
+        pull = self.stiffness * (value - z)
+        return Vector((-pull * dx, -pull * dy, pull))
+
+    def energy(self, state: State) -> Array | None:
+        """k/2 (d - z)^2, summed [J], where conservative; else None."""
+        if not self.conservative:
+            return None
+        x, y, z = _coordinates(state)
+        error = _surface(self).value(x, y) - z
+        return jnp.sum(0.5 * self.stiffness * error * error)
+
+    def stiffness_bound(self, state: State) -> Array:
+        """k, or k (1 + |grad d|^2) where conservative [N/m]."""
+        # The z-only law is triangular, with eigenvalues 0 and k. The conservative one is about k n n' with n = (-grad d, 1).
+        if not self.conservative:
+            return self.stiffness.astype(state.dtype)
+        _, dx, dy = _surface(self).value_and_gradient(*_coordinates(state)[:2])
+        return self.stiffness.astype(state.dtype) * (1 + dx * dx + dy * dy)
+
+    def diagnose(self, state: State) -> tuple[Finding, ...]:
+        """OUTSIDE: nodes beyond the image's border."""
+        return _outside(_surface(self), state)
+
+    def invalid(self) -> Array:
+        """Whether the stiffness is negative or NaN."""
+        return any_negative_or_nan(self.stiffness)
+
+
+class ImageAttraction(Force):
+    """Nodes are drawn to where the image is bright: the image is a potential.
+
+    Attributes:
+        image: d(x, y).
+        strength: [J per unit of the image]; negative draws to the dark.
+        sampling: how the image is read between pixels; the cubic spline has a continuous force.
+    """
+
+    image: Image | Surface
+    strength: Array
+    sampling: Any
+
+    def __init__(self, image: Image, strength: Any, sampling: Any = None):
+        self.image = image
+        self.strength = as_inexact("strength", strength)
+        self.sampling = Bilinear() if sampling is None else sampling
+
+    def prepare(self, dtype: Any) -> ImageAttraction:
+        """The image ready to be read, constants of `dtype`."""
+        return _prepared(self, dtype)
+
+    def force(self, state: State) -> Vector:
+        """Strength grad d [N]; no force along z."""
+        _, dx, dy = _surface(self).value_and_gradient(state.position[0], state.position[1])
+        rest = tuple(jnp.zeros_like(dx) for _ in range(state.dim - 2))
+        return Vector((self.strength * dx, self.strength * dy, *rest))
+
+    def energy(self, state: State) -> Array:
+        """-strength d, summed [J]."""
+        return -jnp.sum(self.strength * _surface(self).value(state.position[0], state.position[1]))
+
+    def diagnose(self, state: State) -> tuple[Finding, ...]:
+        """OUTSIDE: nodes beyond the image's border."""
+        return _outside(_surface(self), state)
+
+
+def _surface(effect: DataSprings | ImageAttraction) -> Surface:
+    return effect.image.surface(effect.sampling) if isinstance(effect.image, Image) else effect.image
+
+
+def _prepared(effect: Any, dtype: Any) -> Any:
+    """The effect with its image ready to be read: a spline is filtered once, not in every step."""
+    return cast_inexact(eqx.tree_at(lambda e: e.image, effect, _surface(effect)), dtype)
+
+
+def _coordinates(state: State) -> tuple[Array, Array, Array]:
+    if state.dim != 3:
+        raise ValueError(f"DataSprings act along z and need positions of 3 coordinates; these have {state.dim}.")
+    return state.position.x, state.position.y, state.position.z
+
+
+def _outside(image: Surface, state: State) -> tuple[Finding, ...]:
+    beyond = image.outside(state.position[0], state.position[1])
+    node = jnp.argmax(jnp.ravel(beyond)).astype(jnp.int32)
+    return (Finding(Flag.OUTSIDE, jnp.sum(beyond).astype(jnp.int32), node),)

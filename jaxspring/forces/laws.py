@@ -1,0 +1,235 @@
+"""The physics of one spring: a pull along `d`, head minus tail.
+
+    pull on the tail   p = w(r^2; k, l) d            [N]     r = |d|
+    stiffness block    w (I - u u') + (w + s) u u'   [N/m]   u = d / r,  s = r dw/dr
+
+A law gives the weight `w` and the slope `s`; `spring_pull` makes a force of them whose tangent brings its own transpose, since
+a spring's block is symmetric. Zero length with a rest length has no direction: the pull is 0 there and the block is taken as k I.
+
+Source: slide "Force Computation", with the length written |r| - l; blocks as in Baraff and Witkin (1998), section 4.
+"""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from ..numerics import linear_call, tiny
+from ..vector import Vector
+
+
+class Law(eqx.Module):
+    """Constitutive law of one spring. Abstract. All arguments of the methods broadcast against each other."""
+
+    @abc.abstractmethod
+    def weight(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
+        """Pull per unit of difference [N/m]; the pull is this times `d`."""
+
+    @abc.abstractmethod
+    def energy(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array | None:
+        """Energy of the spring [J], or None where the law has none."""
+
+    def slope(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
+        """Length times the derivative of the weight by the length [N/m]."""
+        _, tangent = jax.jvp(lambda r2: self.weight(r2, stiffness, rest_length), (squared_length,), (2 * squared_length,))
+        return tangent
+
+
+class Hooke(Law):
+    """Linear law: the pull is k (r - l). Odd under stretch and squeeze; the block is indefinite when squeezed."""
+
+    def weight(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
+        """K (1 - l / r) [N/m]."""
+        # One rsqrt, guarded by a maximum: as fast as no guard. The derivative rule treats length zero.
+        return stiffness * (1 - rest_length * _inverse_length(squared_length))
+
+    def slope(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
+        """K l / r [N/m]."""
+        return stiffness * (rest_length * _inverse_length(squared_length))
+
+    def energy(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
+        """k/2 (r - l)^2 [J]."""
+        stretch = _length(squared_length) - rest_length
+        return 0.5 * stiffness * stretch * stretch
+
+
+class TensionOnly(Law):
+    """Hooke's law when stretched, nothing when squeezed: a rope."""
+
+    def weight(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
+        """K max(0, 1 - l / r) [N/m]."""
+        return stiffness * jnp.maximum(1 - rest_length * _inverse_length(squared_length), jnp.zeros((), squared_length.dtype))
+
+    def energy(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
+        """k/2 max(0, r - l)^2 [J]."""
+        stretch = jnp.maximum(_length(squared_length) - rest_length, jnp.zeros((), squared_length.dtype))
+        return 0.5 * stiffness * stretch * stretch
+
+
+class PowerLaw(Law):
+    """Pull k l (|r - l| / l)^n with the sign of r - l: stiffens (n > 1) with stretch. Needs rest lengths above zero.
+
+    Attributes:
+        exponent: n, at least 1 (1 is Hooke's law).
+    """
+
+    exponent: float = eqx.field(static=True, default=3.0)
+
+    def __check_init__(self) -> None:
+        if self.exponent < 1:
+            raise ValueError(f"exponent = {self.exponent}; expected 1 or more: below 1 the stiffness is infinite at rest.")
+
+    def weight(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
+        """K l sign(e) |e / l|^n / r [N/m]."""
+        strain = _length(squared_length) / rest_length - 1
+        return stiffness * rest_length * jnp.sign(strain) * _power(jnp.abs(strain), self.exponent) * _inverse_length(squared_length)
+
+    def energy(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
+        """K l^2 |e / l|^(n+1) / (n+1) [J]."""
+        strain = _length(squared_length) / rest_length - 1
+        return stiffness * rest_length * rest_length * _power(jnp.abs(strain), self.exponent + 1) / (self.exponent + 1)
+
+
+class EnergyLaw(Law):
+    """A law given by the energy of one spring as a function of its length.
+
+    Attributes:
+        function: (length [m], stiffness, rest_length) -> energy [J], elementwise and differentiable in the length.
+
+    >>> law = EnergyLaw(lambda r, k, l: 0.5 * k * (r - l) ** 2)
+    """
+
+    function: Callable[[Array, Array, Array], Array]
+
+    def weight(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
+        """Derivative of the energy by the length, over the length [N/m]."""
+        length = _length(squared_length)
+        _, pull = jax.jvp(lambda r: self.function(r, stiffness, rest_length), (length,), (jnp.ones_like(length),))
+        return pull * _inverse_length(squared_length)
+
+    def energy(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
+        """The user's function."""
+        return self.function(_length(squared_length), stiffness, rest_length)
+
+
+class PullLaw(Law):
+    """A law given by the pull of one spring as a function of its length; it has no energy.
+
+    Attributes:
+        function: (length [m], stiffness, rest_length) -> pull [N], positive when the ends are drawn together.
+    """
+
+    function: Callable[[Array, Array, Array], Array]
+
+    def weight(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
+        """The user's pull over the length [N/m]."""
+        return self.function(_length(squared_length), stiffness, rest_length) * _inverse_length(squared_length)
+
+    def energy(self, squared_length: Array, stiffness: Array, rest_length: Array) -> None:
+        """A pull alone names no energy."""
+        return None
+
+
+@eqx.filter_custom_jvp
+def spring_pull(law: Law, d: Vector, stiffness: Array, rest_length: Array) -> Vector:
+    """Pull of each spring on its tail [N]; d, stiffness and rest_length of one family."""
+    return law.weight(d.dot(d), stiffness, rest_length) * d
+
+
+@spring_pull.def_jvp
+def _spring_pull_jvp(primals: Any, tangents: Any) -> tuple[Vector, Vector]:
+    law, d, stiffness, rest_length = primals
+    pull = spring_pull(law, d, stiffness, rest_length)
+    params, static = eqx.partition(law, eqx.is_inexact_array)
+    moving = (tangents[1], tangents[2], tangents[3], tangents[0])
+    filled = jax.tree.map(_zero_where_none, moving, (d, stiffness, rest_length, params), is_leaf=lambda leaf: leaf is None)
+    tangent = linear_call(partial(_tangent, static), partial(_tangent_transpose, static), (d, stiffness, rest_length, params), filled)
+    return pull, tangent
+
+
+def _zero_where_none(tangent: Any, primal: Any) -> Any:
+    return jax.tree.map(jnp.zeros_like, primal) if tangent is None else tangent
+
+
+def _tangent(static: Any, residuals: Any, operand: Any) -> Vector:
+    """Dp = w dd + s u (u . dd) + (w_k dk + w_l dl + ...) d."""
+    d, stiffness, rest_length, params = residuals
+    dd, *constants = operand
+    squared = d.dot(d)
+    weight, slope, inverse = _linearised(eqx.combine(params, static), squared, stiffness, rest_length)
+    of_constants = partial(_weight, static, squared)
+    _, by_constants = jax.jvp(of_constants, (stiffness, rest_length, params), tuple(constants))
+    along = slope * (d.dot(dd) * inverse) * inverse + by_constants
+    return weight * dd + along * d
+
+
+def _tangent_transpose(static: Any, residuals: Any, q: Vector) -> Any:
+    """The same block on q, as it is symmetric; and the products with the derivatives of the weight."""
+    d, stiffness, rest_length, params = residuals
+    squared = d.dot(d)
+    weight, slope, inverse = _linearised(eqx.combine(params, static), squared, stiffness, rest_length)
+    # A division, so that XLA keeps it as an array of its own instead of computing it anew in each of its five readers.
+    length = jnp.maximum(squared, tiny(squared.dtype)) * inverse
+    along = d.dot(q) / length
+    _, pullback = jax.vjp(partial(_weight, static, squared), stiffness, rest_length, params)
+    dk, dl, dparams = pullback(along * (squared * inverse))
+    return weight * q + (slope * along * inverse) * d, dk, dl, dparams
+
+
+def _weight(static: Any, squared: Array, stiffness: Array, rest_length: Array, params: Any) -> Array:
+    return eqx.combine(params, static).weight(squared, stiffness, rest_length)
+
+
+def _linearised(law: Law, squared: Array, stiffness: Array, rest_length: Array) -> tuple[Array, Array, Array]:
+    """Weight, slope and inverse length for the derivative; a spring of no length is taken as k I."""
+    is_long = squared > tiny(squared.dtype)
+    zero = jnp.zeros((), squared.dtype)
+    weight = jnp.where(is_long, law.weight(squared, stiffness, rest_length), stiffness)
+    slope = jnp.where(is_long, law.slope(squared, stiffness, rest_length), zero)
+    return weight, slope, _inverse_length(squared)
+
+
+@eqx.filter_custom_jvp
+def spring_energy(law: Law, d: Vector, stiffness: Array, rest_length: Array) -> Array:
+    """Energy of each spring [J]; its derivative by `d` is the pull, guarded alike."""
+    return law.energy(d.dot(d), stiffness, rest_length)
+
+
+@spring_energy.def_jvp
+def _spring_energy_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
+    law, d, stiffness, rest_length = primals
+    energy = law.energy(d.dot(d), stiffness, rest_length)
+    total = jnp.zeros_like(energy)
+    if tangents[1] is not None and any(t is not None for t in tangents[1]):
+        dd = Vector(tuple(jnp.zeros_like(p) if t is None else t for t, p in zip(tangents[1], d, strict=True)))
+        total = total + spring_pull(law, d, stiffness, rest_length).dot(dd)
+    for i in (2, 3):
+        if tangents[i] is not None:
+
+            def vary(value: Array, i: int = i) -> Array:
+                return law.energy(d.dot(d), *(value if j == i else primals[j] for j in (2, 3)))
+
+            total = total + jax.jvp(vary, (primals[i],), (tangents[i],))[1]
+    return energy, total
+
+
+def _inverse_length(squared: Array) -> Array:
+    return lax.rsqrt(jnp.maximum(squared, tiny(squared.dtype)))
+
+
+def _length(squared: Array) -> Array:
+    return squared * _inverse_length(squared)
+
+
+def _power(base: Array, exponent: float) -> Array:
+    """base**exponent for base >= 0, exponent >= 1, with a finite derivative at zero."""
+    is_zero = base == 0
+    return jnp.where(is_zero, 0, jnp.where(is_zero, 1, base) ** jnp.asarray(exponent, base.dtype)).astype(base.dtype)

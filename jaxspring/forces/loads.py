@@ -1,0 +1,96 @@
+"""Loads: gravity, and forces given by the user, constant or in time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._checks import as_inexact, finite, shape_of
+from ..state import State
+from ..topology.base import Topology
+from ..vector import Vector
+from .base import Force
+
+
+class Gravity(Force):
+    """Weight of every node, f = m g.
+
+    Attributes:
+        acceleration: (D,) [m/s^2], e.g. (0, 0, -9.81).
+        mass: [kg], one number or a node array; `System` fills it in.
+    """
+
+    acceleration: Array
+    mass: Array | None
+
+    def __init__(self, acceleration: Any, mass: Any = None):
+        self.acceleration = as_inexact("acceleration", acceleration)
+        finite("acceleration", self.acceleration)
+        if self.acceleration.ndim != 1 or self.acceleration.shape[0] not in (1, 2, 3):
+            raise ValueError(
+                f"acceleration has shape {self.acceleration.shape}; expected (D,), one number per coordinate, e.g. (0, 0, -9.81)."
+            )
+        self.mass = None if mass is None else as_inexact("mass", mass)
+
+    def with_mass(self, mass: Array) -> Gravity:
+        """The same gravity acting on these masses; masses that were given stay."""
+        return self if self.mass is not None else Gravity(self.acceleration, mass)
+
+    def force(self, state: State) -> Vector:
+        """M g [N]."""
+        return Vector(tuple(self._weight(g, a) for g, a in zip(self._acceleration(state), state.position, strict=True)))
+
+    def energy(self, state: State) -> Array:
+        """-m g . x, summed [J]; zero at the origin."""
+        mass = self._mass()
+        parts = [jnp.sum(mass * a) * g for g, a in zip(self._acceleration(state), state.position, strict=True)]
+        return -sum(parts[1:], start=parts[0])
+
+    def _weight(self, g: Array, like: Array) -> Array:
+        return jnp.broadcast_to(g * self._mass(), like.shape)
+
+    def _acceleration(self, state: State) -> Array:
+        if self.acceleration.shape[0] != state.dim:
+            raise ValueError(f"acceleration has {self.acceleration.shape[0]} coordinates, the positions have {state.dim}.")
+        return self.acceleration
+
+    def _mass(self) -> Array:
+        if self.mass is None:
+            raise ValueError("Gravity has no masses yet. Put it in a System, or pass Gravity(acceleration, mass).")
+        return self.mass
+
+
+class Load(Force):
+    """A given force on the nodes: constant, or a function of time.
+
+    Attributes:
+        value: `Vector` in node shape [N], or a function of time [s] that returns one.
+
+    >>> import jax.numpy as jnp
+    >>> from jaxspring.topology.lattice import lattice
+    >>> push = Load.from_points(lattice(2), [[0.0, 0.0], [1.0, 0.0]])
+    """
+
+    value: Vector | Callable[[Array], Vector]
+
+    @staticmethod
+    def from_points(net: Topology, forces: Any) -> Load:
+        """A constant load from an (N, D) array [N] in the user's node order."""
+        return Load(net.vector_field(forces, "forces"))
+
+    def force(self, state: State) -> Vector:
+        """The given force [N]."""
+        load = self.value if isinstance(self.value, Vector) else self.value(state.time)
+        if not isinstance(load, Vector) or load.dim != state.dim or load.shape != state.position.shape:
+            raise ValueError(
+                f"a load must be a Vector of {state.dim} arrays of shape {state.position.shape}; got "
+                f"{type(load).__name__} of shape {shape_of(load)}."
+            )
+        return load.map(lambda a: a.astype(state.dtype))
+
+    def energy(self, state: State) -> Array | None:
+        """-f . x, summed [J], where the load is constant; None where it varies in time."""
+        return -jnp.sum(self.value.dot(state.position)) if isinstance(self.value, Vector) else None

@@ -1,0 +1,193 @@
+"""Springs: the internal force g_i = sum over neighbours of s_ij.
+
+    s_ij = k_ij (|r_ij| - l_ij) r_ij / |r_ij|      force on i from the spring to j [N],  r_ij = x_j - x_i
+
+Source: slide "Force Computation" (length |r|, deformation e = |r| - l).
+"""
+
+from __future__ import annotations
+
+import abc
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._checks import is_concrete, nonnegative
+from ..numerics import tiny
+from ..state import State
+from ..status import Flag
+from ..topology.base import Topology
+from ..topology.edge_field import EdgeField
+from ..vector import Vector
+from .base import Finding, Force, any_negative_or_nan
+from .laws import Hooke, Law, spring_energy, spring_pull
+
+
+class StiffnessRule(eqx.Module):
+    """A stiffness that follows the state (an image under the node, a temperature). Abstract."""
+
+    @abc.abstractmethod
+    def stiffness(self, net: Topology, state: State) -> Array | EdgeField:
+        """Stiffness of each spring [N/m] in this state."""
+
+    @abc.abstractmethod
+    def upper_bound(self) -> Array:
+        """The largest stiffness the rule can give [N/m], for `stable_dt`."""
+
+    def prepare(self, net: Topology, dtype: Any) -> StiffnessRule:
+        """The rule as the loop wants it: constants cast, tables made. Called once, before the loop."""
+        from ..numerics import cast_inexact
+
+        return cast_inexact(self, dtype)
+
+
+class Springs(Force):
+    """Springs along every edge of a network.
+
+    Attributes:
+        net: the topology.
+        stiffness: k [N/m]: a number, (E,) in the user's order, an `EdgeField`, or a `StiffnessRule`.
+        rest_length: l [m]: a number, (E,) or an `EdgeField`.
+        law: the law of one spring; `Hooke()` unless said.
+        axes: the coordinates the springs act in (None: all). `axes=(0, 1)` makes springs of the projection on the plane.
+
+    Raises:
+        ValueError: a negative or non-finite constant (named with its index), a shape that fits neither one number nor one per spring.
+    """
+
+    net: Topology
+    stiffness: Any
+    rest_length: Any
+    law: Law
+    axes: tuple[int, ...] | None = eqx.field(static=True)
+
+    def __init__(
+        self,
+        net: Topology,
+        stiffness: Any,
+        rest_length: Any = 0.0,
+        law: Law | None = None,
+        axes: tuple[int, ...] | None = None,
+        allow_negative_stiffness: bool = False,
+    ):
+        self.net = net
+        self.stiffness = stiffness if isinstance(stiffness, StiffnessRule) else _edge_constant(net, "stiffness", stiffness)
+        self.rest_length = _edge_constant(net, "rest_length", rest_length)
+        self.law = Hooke() if law is None else law
+        self.axes = None if axes is None else tuple(int(a) for a in axes)
+        if not isinstance(stiffness, StiffnessRule) and not allow_negative_stiffness:
+            _check_sign(
+                "stiffness", self.stiffness, "A negative stiffness pushes without bound. Pass allow_negative_stiffness=True if meant."
+            )
+        _check_sign("rest_length", self.rest_length, "A length cannot be negative.")
+
+    def prepare(self, dtype: Any) -> Springs:
+        """Constants as edge fields of `dtype`."""
+        from ..numerics import cast_inexact
+
+        rule = self.stiffness
+        stiffness = rule.prepare(self.net, dtype) if isinstance(rule, StiffnessRule) else self.net.edge_field(rule, "stiffness")
+        ready = eqx.tree_at(lambda s: (s.stiffness, s.rest_length), self, (stiffness, self.net.edge_field(self.rest_length, "rest_length")))
+        return cast_inexact(ready, dtype)
+
+    def force(self, state: State) -> Vector:
+        """Sum of the pulls at each node [N]."""
+        if self.net.n_springs == 0:
+            return Vector.zeros_like(state.position)
+        d, k, l = self._along(state)
+        pulls = self.net.map_springs(lambda *spring: spring_pull(self.law, *spring), d, k, l)
+        return self._embed(self.net.accumulate(pulls), state)
+
+    def energy(self, state: State) -> Array | None:
+        """Sum of the springs' energies [J]; None where the law has none."""
+        if self.net.n_springs == 0:
+            return jnp.zeros((), state.dtype)
+        if isinstance(self.stiffness, StiffnessRule):
+            return None
+        one = jnp.ones((), state.dtype)
+        if self.law.energy(one, one, one) is None:
+            return None
+        return self.net.map_springs(lambda *spring: spring_energy(self.law, *spring), *self._along(state)).sum()
+
+    def tension(self, state: State) -> EdgeField:
+        """Pull of each spring along itself [N]: positive stretched, negative squeezed. `net.flatten` gives (E,)."""
+
+        def of_family(d: Vector, k: Array, l: Array) -> Array:
+            return self.law.weight(d.dot(d), k, l) * d.norm()
+
+        return self.net.map_springs(of_family, *self._along(state))
+
+    def strain(self, state: State) -> EdgeField:
+        """Stretch over rest length, (r - l) / l; infinite where l = 0."""
+        d, _, l = self._along(state)
+        return self.net.map_springs(lambda d, l: d.norm() / l - 1, d, l)
+
+    def stiffness_bound(self, state: State) -> Array | None:
+        """Gershgorin: twice the sum of the stiffnesses at each node [N/m]."""
+        if self.net.n_springs == 0:
+            return None
+        k = self.stiffness.upper_bound() if isinstance(self.stiffness, StiffnessRule) else self.net.edge_field(self.stiffness)
+        k = self._steepest(state, k.astype(state.dtype) if not isinstance(k, EdgeField) else k)
+        return 2 * self.net.incident_sum(k)
+
+    def diagnose(self, state: State) -> tuple[Finding, ...]:
+        """COINCIDENT: springs with a rest length whose ends are at one place."""
+        if self.net.n_springs == 0 or (is_concrete(self.rest_length) and not jnp.any(self.rest_length > 0)):
+            return ()
+        d, _, l = self._along(state)
+
+        def degenerate(d: Vector, l: Array) -> Array:
+            squared = d.dot(d)
+            return (squared <= tiny(squared.dtype)) & (l > 0)
+
+        count = self.net.map_springs(degenerate, d, l).sum().astype(jnp.int32)
+        return (Finding(Flag.COINCIDENT, count, jnp.asarray(-1, jnp.int32)),)
+
+    def invalid(self) -> Array | None:
+        """Whether a rest length is negative or a constant is NaN."""
+        return any_negative_or_nan(self.rest_length)
+
+    def _along(self, state: State) -> tuple[EdgeField, Array | EdgeField, Array | EdgeField]:
+        x = state.position if self.axes is None else Vector(tuple(state.position[a] for a in self.axes))
+        rule = self.stiffness
+        k = rule.stiffness(self.net, state) if isinstance(rule, StiffnessRule) else self.net.edge_field(rule, "stiffness")
+        return self.net.difference(x), k, self.net.edge_field(self.rest_length, "rest_length")
+
+    def _embed(self, force: Vector, state: State) -> Vector:
+        if self.axes is None:
+            return force
+        zero = jnp.zeros_like(state.position[0])
+        return Vector(tuple(force[self.axes.index(i)] if i in self.axes else zero for i in range(state.dim)))
+
+    def _steepest(self, state: State, k: Array | EdgeField) -> EdgeField:
+        """Largest positive eigenvalue of each spring's block [N/m]."""
+        d, _, l = self._along(state)
+
+        def of_family(d: Vector, k: Array, l: Array) -> Array:
+            squared = d.dot(d)
+            weight = self.law.weight(squared, k, l)
+            radial = weight + self.law.slope(squared, k, l)
+            is_long = squared > tiny(squared.dtype)
+            return jnp.where(is_long, jnp.maximum(jnp.maximum(weight, radial), jnp.zeros((), squared.dtype)), k)
+
+        return self.net.map_springs(of_family, d, k, l)
+
+
+def _edge_constant(net: Topology, name: str, value: Any) -> Any:
+    """`value` as the user passed it (so that its gradient comes back in that form), as inexact arrays of a shape that fits."""
+    from .._checks import as_inexact, has_shape
+
+    if isinstance(value, EdgeField):
+        net.edge_field(value, name)
+        return value
+    value = as_inexact(name, value)
+    has_shape(name, value, {"one number": (), "one per spring": (net.n_springs,)})
+    return value
+
+
+def _check_sign(name: str, value: Any, why: str) -> None:
+    entries = value.families if isinstance(value, EdgeField) else (value,)
+    for i, entry in enumerate(entries):
+        nonnegative(f"{name}.families[{i}]" if isinstance(value, EdgeField) else name, entry, why)

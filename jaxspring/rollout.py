@@ -1,0 +1,241 @@
+"""Fixed steps in time: `rollout`.
+
+The steps run in blocks of about sqrt(n_steps), a scan of scans, both levels rematerialised in reverse mode: the memory of a gradient
+grows with the square root of the number of steps, and costs one more forward run. Status is taken once per block: NaN is sticky, so the
+failed block is replayed to find the step. Time is exact: t = t0 + i dt.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ._checks import finite, is_concrete
+from .blocks import Checkpointed, Plan, StoreAll, make_plan, run_blocks
+from .numerics import is_traced, stopped
+from .progress import LONG_RUN, N_CHUNKS, Progress
+from .state import State
+from .status import EXPLANATION, Flag, StabilityWarning, Status
+from .steppers.base import Stepper
+from .steppers.stability import dt_limit
+from .system import System
+from .watch import Carry, begin, inspect, settle
+
+
+class Info(eqx.Module):
+    """Facts about a run.
+
+    Attributes:
+        stable_dt: largest dt [s] that is surely stable at the start; None where the stepper does not know.
+        n_steps: steps that were done.
+    """
+
+    stable_dt: Array | None
+    n_steps: Array
+
+
+class Resume(eqx.Module):
+    """What an unbroken run carries besides its state: pass it to `rollout(resume=...)` to go on bit for bit."""
+
+    start_time: Array
+    step: Array
+    memory: Any
+
+
+class Result(eqx.Module):
+    """What a rollout returns.
+
+    Attributes:
+        state: the last state.
+        saved: states (or whatever `observe` returns) after steps save_every, 2 save_every, ..., stacked on a leading axis; else None.
+        status: what went wrong, if anything; see `raise_for_status`.
+        info: facts about the run.
+        resume: for going on bit for bit.
+        effects: names of the system's forces, for messages (static).
+    """
+
+    state: State
+    saved: Any
+    status: Status
+    info: Info
+    resume: Resume
+    effects: tuple[str, ...] = eqx.field(static=True)
+
+
+def rollout(
+    system: System,
+    state: State,
+    stepper: Stepper,
+    dt: Any,
+    n_steps: int,
+    save_every: int | None = None,
+    observe: Callable[[State], Any] | None = None,
+    adjoint: Checkpointed | StoreAll | None = None,
+    progress: Progress | None = None,
+    check_every: int | None = None,
+    resume: Resume | None = None,
+) -> Result:
+    """Advance a state by `n_steps` steps of `dt`.
+
+    Args:
+        system: what is simulated.
+        state: where it starts. Float32 in, float32 out.
+        stepper: how it steps, e.g. `SymplecticEuler()`.
+        dt: time step [s]; may be traced. Zero returns the state unchanged; negative runs backward.
+        n_steps: number of steps (static).
+        save_every: keep a frame after every so many steps; must divide `n_steps`. None keeps none.
+        observe: what to keep of a state in each frame; None keeps the whole state. A new lambda at every call compiles anew.
+        adjoint: how reverse mode remembers; `Checkpointed()` unless said.
+        progress: a `Progress` shows a bar and may call the host between chunks of steps.
+        check_every: look for trouble every so many steps instead of once per block.
+        resume: the `resume` of an earlier result, to go on as if unbroken.
+
+    Returns:
+        A `Result`. Trouble is in its status, never an exception: call `raise_for_status(result)`. An eager call that is interrupted
+        (Ctrl-C) returns what was done, with INTERRUPTED.
+
+    Raises:
+        ValueError: n_steps or save_every that do not fit, a dt that is not finite, `observe` without `save_every`.
+
+    >>> import jaxspring as js
+    >>> net = js.lattice(2)
+    >>> system = js.System(net, mass=1.0, forces=js.Springs(net, 1.0, 1.0))
+    >>> result = rollout(system, js.State.from_points(net, net.grid()), js.SymplecticEuler(), dt=0.1, n_steps=10)
+    >>> print(result.state.time)
+    1.0
+    """
+    _check_steps(n_steps, save_every, observe, check_every)
+    if is_concrete(dt):
+        finite("dt", dt)
+    dt = jnp.asarray(dt, state.dtype)
+    plan = make_plan(n_steps, save_every, Checkpointed() if adjoint is None else adjoint, check_every)
+    resume = Resume(state.time, jnp.zeros((), jnp.int32), _Unset()) if resume is None else resume
+    if is_traced(system, state, dt, resume):
+        return _compiled(system, state, stepper, dt, plan, observe, resume, progress)
+    result = _run_eagerly(system, state, stepper, dt, plan, observe, resume, progress)
+    if bool(result.status.has(Flag.DT_LIMIT)):
+        text = f"dt = {float(dt):.6g} s, but this run is surely stable only up to {float(result.info.stable_dt):.6g} s"
+        warnings.warn(f"DT_LIMIT: {EXPLANATION[Flag.DT_LIMIT]}: {text}.", StabilityWarning, stacklevel=2)
+    return result
+
+
+def _run(
+    system: System,
+    state: State,
+    stepper: Stepper,
+    dt: Array,
+    plan: Plan,
+    observe: Callable[[State], Any] | None,
+    resume: Resume,
+    progress: Progress | None = None,
+) -> Result:
+    """The whole run as one traced program."""
+    ready = system.prepare(state.dtype)
+    start = ready.constrain(state)
+    limit = dt_limit(ready, start, stepper)
+    memory = stepper.init(ready, start) if isinstance(resume.memory, _Unset) else resume.memory
+    carry = Carry(start, memory, resume.step)
+
+    advance = partial(_advance, ready, stepper, dt, resume.start_time)
+
+    def report(carry: Carry) -> None:
+        if progress is not None:
+            jax.debug.callback(lambda done: progress.update(done, plan.n_steps), carry.step)
+
+    watch = begin(ready, carry, dt, limit)
+    keep = _whole_state if observe is None else observe
+    (carry, watch), saved = run_blocks(advance, partial(inspect, ready), keep, report, (carry, watch), plan)
+    # The replay of a failed block is not part of what is differentiated.
+    still, still_dt, still_time = stopped((ready, dt, resume.start_time))
+    return Result(
+        state=carry.state,
+        saved=saved,
+        status=settle(partial(_advance, still, stepper, still_dt, still_time), watch, still),
+        info=Info(limit, carry.step),
+        resume=Resume(resume.start_time, carry.step, carry.memory),
+        effects=tuple(type(f).__name__ for f in system.forces),
+    )
+
+
+def _advance(system: System, stepper: Stepper, dt: Array, start_time: Array, carry: Carry) -> Carry:
+    index = carry.step + 1
+    state, memory = stepper.step(system, carry.state, dt, carry.memory)
+    state = eqx.tree_at(lambda s: s.time, state, start_time + index.astype(dt.dtype) * dt)
+    return Carry(state if system.motion is None else system.constrain(state), memory, index)
+
+
+_compiled = eqx.filter_jit(_run)
+
+
+def _run_eagerly(
+    system: System,
+    state: State,
+    stepper: Stepper,
+    dt: Array,
+    plan: Plan,
+    observe: Callable[[State], Any] | None,
+    resume: Resume,
+    progress: Progress | None,
+) -> Result:
+    """The run in chunks, with the host between them where somebody watches or the run is long."""
+    is_long = progress is not None or plan.n_steps * math.prod(state.position.shape) > LONG_RUN
+    pieces = plan.pieces(N_CHUNKS) if is_long else [plan]
+    result, frames, done = None, [], 0
+    try:
+        for piece in pieces:
+            latest = _compiled(system, state, stepper, dt, piece, observe, resume)
+            if len(pieces) > 1 or progress is not None:
+                jax.block_until_ready(latest)
+            if result is not None:
+                latest = eqx.tree_at(lambda r: (r.status, r.info), latest, (result.status.then(latest.status), _joined(result, latest)))
+            result, state, resume, done = latest, latest.state, latest.resume, done + piece.n_steps
+            frames.append(latest.saved)
+            if progress is not None:
+                progress.update(done, plan.n_steps)
+    except KeyboardInterrupt:
+        if result is None:
+            raise
+        stopped = Status.when(Flag.INTERRUPTED, True, step=resume.step)
+        result = eqx.tree_at(lambda r: r.status, result, result.status.then(stopped))
+    if len(frames) > 1 and plan.save_every is not None:
+        saved = jax.tree.map(lambda *parts: jnp.concatenate(parts), *frames)
+        result = eqx.tree_at(lambda r: r.saved, result, saved)
+    return result
+
+
+def _joined(first: Result, latest: Result) -> Info:
+    return Info(first.info.stable_dt, latest.info.n_steps)
+
+
+class _Unset(eqx.Module):
+    """A stepper's memory that is not made yet."""
+
+
+def _whole_state(state: State) -> State:
+    return state
+
+
+def _check_steps(n_steps: int, save_every: int | None, observe: Any, check_every: int | None) -> None:
+    for name, value, least in (("n_steps", n_steps, 0), ("save_every", save_every, 1), ("check_every", check_every, 1)):
+        if value is None and name != "n_steps":
+            continue
+        if isinstance(value, jax.core.Tracer) or not isinstance(value, (int, np.integer)) or isinstance(value, bool):
+            raise TypeError(f"{name} = {value!r}; expected a whole number, known when the program is compiled.")
+        if value < least:
+            raise ValueError(f"{name} = {value}; expected {least} or more.")
+    if observe is not None and save_every is None:
+        raise ValueError("observe says what to keep of each frame, but save_every is None, so that there are no frames. Pass save_every.")
+    if save_every is not None and n_steps % save_every:
+        raise ValueError(
+            f"n_steps = {n_steps} is not a multiple of save_every = {save_every}: the last {n_steps % save_every} steps would be in no "
+            f"frame. Pass n_steps = {n_steps - n_steps % save_every} or {n_steps - n_steps % save_every + save_every}."
+        )

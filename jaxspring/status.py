@@ -1,0 +1,163 @@
+"""What went wrong, as a value: failures are numbers inside `jit` and exceptions outside.
+
+Every result carries a `Status`. It names the flags that were raised and, for the first trouble, the step, the node and the effect.
+`raise_for_status` is the one way from a status to an exception.
+"""
+
+from __future__ import annotations
+
+import enum
+import warnings
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int, UInt32
+
+
+class Flag(enum.IntFlag):
+    """Kinds of trouble. Those in `WARNINGS` leave a usable result; the others do not."""
+
+    OK = 0
+    NONFINITE = 1
+    ENERGY_ROSE = 2
+    CG_MAXITER = 4
+    CG_INDEFINITE = 8
+    LINE_SEARCH = 16
+    MECHANISM = 32
+    PIVOT = 64
+    COINCIDENT = 128
+    OVERLAP = 256
+    OUTSIDE = 512
+    NEIGHBOUR_OVERFLOW = 1024
+    MAX_STEPS = 2048
+    INTERRUPTED = 4096
+    DT_LIMIT = 8192
+    INVALID = 16384
+
+
+WARNINGS = Flag.COINCIDENT | Flag.OVERLAP | Flag.OUTSIDE | Flag.DT_LIMIT
+
+EXPLANATION = {
+    Flag.NONFINITE: "a position or velocity is NaN or infinite; try a smaller dt (see stable_dt), or look for a bad parameter",
+    Flag.ENERGY_ROSE: "an implicit step raised the energy; try a smaller dt, or Newton's step",
+    Flag.CG_MAXITER: "conjugate gradients ran out of iterations; raise max_iter, loosen the tolerance or use a preconditioner",
+    Flag.CG_INDEFINITE: "the matrix is not positive definite; conjugate gradients cannot be trusted on it",
+    Flag.LINE_SEARCH: "the line search found no step that lowers the potential",
+    Flag.MECHANISM: "the net can move without a force; pin more nodes or add springs",
+    Flag.PIVOT: "a pivot of the factorisation is not positive",
+    Flag.COINCIDENT: "the ends of a spring with a rest length coincide, so its direction is undefined and its pull was taken as zero",
+    Flag.OVERLAP: "particles overlap; their repulsion was capped",
+    Flag.OUTSIDE: "nodes lie outside the image and take its border value",
+    Flag.NEIGHBOUR_OVERFLOW: "the neighbour list is too small; raise its capacity",
+    Flag.MAX_STEPS: "the adaptive solver ran out of steps; raise max_steps or loosen the tolerance",
+    Flag.INTERRUPTED: "interrupted; the result holds what was done until then",
+    Flag.DT_LIMIT: "dt is above the stability limit of this stepper (see stable_dt)",
+    Flag.INVALID: "a parameter has a value that its constructor would refuse (sign, NaN or infinity)",
+}
+
+NOWHERE = -1
+
+
+class Status(eqx.Module):
+    """Flags raised, and where the first of them was.
+
+    Attributes:
+        flags: bit mask of `Flag`; 0 is OK.
+        step: step at whose end the first trouble was seen (0: before the first step; -1: no trouble).
+        node: node concerned, in the topology's own flat order (-1: none in particular).
+        effect: index into the system's forces (-1: none in particular).
+        count: how many nodes or springs were concerned.
+    """
+
+    flags: UInt32[Array, "*batch"]
+    step: Int[Array, "*batch"]
+    node: Int[Array, "*batch"]
+    effect: Int[Array, "*batch"]
+    count: Int[Array, "*batch"]
+
+    @staticmethod
+    def ok() -> Status:
+        """A status with no flag."""
+        nowhere = jnp.asarray(NOWHERE, jnp.int32)
+        return Status(jnp.zeros((), jnp.uint32), nowhere, nowhere, nowhere, jnp.zeros((), jnp.int32))
+
+    @staticmethod
+    def when(flag: Flag, condition: Any, *, step: Any = NOWHERE, node: Any = NOWHERE, effect: int = NOWHERE, count: Any = 1) -> Status:
+        """A status with `flag` where `condition` holds, and OK where it does not."""
+        raised = jnp.asarray(condition, jnp.bool_)
+
+        def pick(value: Any, otherwise: int) -> Array:
+            return jnp.where(raised, jnp.asarray(value, jnp.int32), jnp.asarray(otherwise, jnp.int32))
+
+        flags = jnp.where(raised, jnp.asarray(int(flag), jnp.uint32), jnp.asarray(0, jnp.uint32))
+        return Status(flags, pick(step, NOWHERE), pick(node, NOWHERE), pick(effect, NOWHERE), pick(count, 0))
+
+    def then(self, later: Status) -> Status:
+        """This status with a later one: flags are joined; place and count are those of the first error, else of the first warning."""
+        warning = jnp.asarray(int(WARNINGS), jnp.uint32)
+        nothing = jnp.asarray(0, jnp.uint32)
+        worse = ((self.flags & ~warning) == nothing) & ((later.flags & ~warning) != nothing)
+        take = (self.flags == nothing) | worse
+
+        def choose(old: Array, new: Array) -> Array:
+            return jnp.where(take, new, old)
+
+        return Status(
+            self.flags | later.flags,
+            choose(self.step, later.step),
+            choose(self.node, later.node),
+            choose(self.effect, later.effect),
+            choose(self.count, later.count),
+        )
+
+    @property
+    def is_ok(self) -> Array:
+        """Whether no error was raised (warnings allowed)."""
+        return (self.flags & jnp.asarray(int(~WARNINGS & 0xFFFF), jnp.uint32)) == jnp.asarray(0, jnp.uint32)
+
+    def has(self, flag: Flag) -> Array:
+        """Whether `flag` was raised."""
+        return (self.flags & jnp.asarray(int(flag), jnp.uint32)) != jnp.asarray(0, jnp.uint32)
+
+    def describe(self, effects: tuple[str, ...] = ()) -> str:
+        """One line a person can act on. Not for traced values."""
+        flags = Flag(int(np.bitwise_or.reduce(np.ravel(np.asarray(self.flags)))))
+        if flags == Flag.OK:
+            return "OK"
+        first = int(np.argmax(np.ravel(np.asarray(self.flags)) != 0))
+        step, node, effect, count = (int(np.ravel(np.asarray(a))[first]) for a in (self.step, self.node, self.effect, self.count))
+        place = [f"step {step}"] if step != NOWHERE else []
+        place += [f"node {node}"] if node != NOWHERE else []
+        place += [f"effect {effects[effect] if effect < len(effects) else effect}"] if effect != NOWHERE else []
+        place += [f"lane {first}"] if np.ndim(self.flags) else []
+        place += [f"count {count}"] if count > 1 else []
+        names = "; ".join(f"{flag.name}: {EXPLANATION[flag]}" for flag in Flag if flag and flag in flags)
+        return names + (f" (first at {', '.join(place)})" if place else "")
+
+
+class SimulationError(RuntimeError):
+    """A simulation ended with an error in its status."""
+
+
+class StabilityWarning(UserWarning):
+    """A simulation ended with a warning in its status, or is about to be run above its stability limit."""
+
+
+def raise_for_status(result: Any) -> None:
+    """Raise `SimulationError` where `result` (or a `Status`) holds an error; warn where it holds a warning only.
+
+    Inside `jit` a status is a traced value: return it and call this outside.
+    """
+    status = result if isinstance(result, Status) else result.status
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(status)):
+        raise TypeError("raise_for_status was called on a traced status. Return the result from jit, and call it outside.")
+    note = getattr(result, "effects", ())
+    if not bool(np.all(np.asarray(status.is_ok))):
+        hint = getattr(getattr(result, "info", None), "stable_dt", None)
+        limit = "" if hint is None else f" The stability limit of this run was dt = {float(np.min(np.asarray(hint))):.6g}."
+        raise SimulationError(status.describe(note) + "." + limit)
+    if bool(np.any(np.asarray(status.flags) != 0)):
+        warnings.warn(status.describe(note), StabilityWarning, stacklevel=2)

@@ -1,0 +1,34 @@
+"""What a stepper is: `init` and `step`, pure functions of the system and the state."""
+
+from __future__ import annotations
+
+import abc
+from typing import Any
+
+import equinox as eqx
+from jaxtyping import Array
+
+from ..state import State
+from ..system import System
+
+
+class Stepper(eqx.Module):
+    """Advances a state by one time step. Abstract.
+
+    To write your own, subclass it and give `step`. A stepper that carries something from step to step (an acceleration, a factor)
+    returns it from `init` and from every `step`. Held nodes: call `system.hold` on what you add to the velocity.
+    """
+
+    def init(self, system: System, state: State) -> Any:
+        """What the stepper carries before its first step; None where it carries nothing."""
+        return None
+
+    @abc.abstractmethod
+    def step(self, system: System, state: State, dt: Array, memory: Any) -> tuple[State, Any]:
+        """The state one `dt` [s] later, and what to carry. The caller sets the new state's time."""
+
+    def limit(self, squared_frequency: Array, damping: Array, damping_floor: Array) -> Array | None:
+        """Largest stable dt [s] for motions of at most that squared frequency [1/s^2] and a damping rate c = gamma / m [1/s] within the
+        two bounds; None where the stepper does not know.
+        """
+        return None

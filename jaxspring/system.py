@@ -1,0 +1,213 @@
+"""A system: nodes with mass, the forces that its scene names, and what is held fixed.
+
+    m_i a_i + gamma_i v_i - g_i - f_i = 0        i.e.  m_i a_i = sum of all forces        [N]
+
+Source: slide "System Dynamics" (Lagrange's equations of motion).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ._checks import as_inexact, has_shape, positive, shape_of
+from .forces.base import Force
+from .numerics import cast_inexact
+from .state import State
+from .topology.base import Topology
+from .vector import Vector
+
+Free = Array | tuple[Array, ...] | None
+
+
+class Energy(eqx.Module):
+    """Energy ledger of one state [J].
+
+    Attributes:
+        kinetic: sum of m v^2 / 2.
+        potential: one entry per force, None where that force has no potential.
+    """
+
+    kinetic: Array
+    potential: tuple[Array | None, ...]
+
+    @property
+    def total(self) -> Array:
+        """Kinetic energy plus every potential that exists."""
+        return sum((p for p in self.potential if p is not None), start=self.kinetic)
+
+
+class Motion(eqx.Module):
+    """Nodes moved by a schedule.
+
+    Attributes:
+        moved: bool, node shape: which nodes follow the schedule.
+        path: (time [s]) -> `Vector` of positions in node shape [m]; its derivative in time is the velocity.
+    """
+
+    moved: Array
+    path: Callable[[Array], Vector]
+
+    def at(self, time: Array) -> tuple[Vector, Vector]:
+        """Positions and velocities that the schedule prescribes at `time`."""
+        return jax.jvp(self.path, (time,), (jnp.ones_like(time),))
+
+
+class System(eqx.Module):
+    """Masses, forces and constraints on a topology. `eqx.filter_grad` with respect to it is the parameter gradient.
+
+    Attributes:
+        net: the topology.
+        mass: [kg], a number or a node array.
+        forces: the effects of the scene, in the order of their indices in statuses.
+        free: None (all move), a bool node array, or one per coordinate: False is held at its place, exactly.
+        motion: nodes moved by a schedule, or None.
+    """
+
+    net: Topology
+    mass: Array
+    forces: tuple[Force, ...]
+    free: Free
+    motion: Motion | None
+
+    def __init__(self, net: Topology, mass: Any, forces: Any = (), free: Any = None, motion: Motion | None = None):
+        """Args:
+            net: the topology.
+            mass: [kg]: a number, or (N,) in the user's order.
+            forces: the effects; a single force is taken as a tuple of one.
+            free: None, (N,) or (N, D) booleans in the user's order; False holds a node, or one coordinate of it.
+            motion: nodes moved by a schedule (they count as not free).
+
+        Raises:
+            ValueError: a mass that is not positive (named with its node), a wrong shape, forces on another topology.
+            TypeError: something in `forces` that is not a `Force`; `free` that is not boolean.
+        """
+        mass = as_inexact("mass", mass)
+        positive("mass", mass, "A node without mass would get an infinite acceleration.")
+        self.net = net
+        self.mass = net.node_field(mass, "mass")
+        self.forces = tuple(self._adopt(i, f) for i, f in enumerate((forces,) if isinstance(forces, Force) else forces))
+        self.free = _as_free(net, free)
+        self.motion = motion
+
+    def _adopt(self, i: int, force: Any) -> Force:
+        if not isinstance(force, Force):
+            raise TypeError(f"forces[{i}] is a {type(force).__name__}; expected a Force, e.g. Springs(net, ...) or Drag(gamma).")
+        other = getattr(force, "net", None)
+        if other is not None and (other.node_shape != self.net.node_shape or other.node_permutation != self.net.node_permutation):
+            raise ValueError(f"forces[{i}] ({type(force).__name__}) was built on another topology than the system.")
+        return force
+
+    def prepare(self, dtype: Any) -> System:
+        """The system as a loop wants it: every constant in the shape of the topology and of `dtype`."""
+        forces = tuple(f.with_mass(self.mass).prepare(dtype) for f in self.forces)
+        return cast_inexact(eqx.tree_at(lambda s: s.forces, self, forces), dtype)
+
+    def force(self, state: State) -> Vector:
+        """Sum of all forces on each node [N], also where it is held (there it is what the hold must balance)."""
+        total = None
+        for effect in self.forces:
+            f = effect.with_mass(self.mass).force(state)
+            total = f if total is None else total + f
+        return Vector.zeros_like(state.position) if total is None else total
+
+    def acceleration(self, state: State) -> Vector:
+        """Force over mass where free, exactly zero where held [m/s^2]."""
+        return self.hold(self.force(state) * (1 / self.mass.astype(state.dtype)))
+
+    def reaction(self, state: State) -> Vector:
+        """Force of the holds on the nodes [N]: minus the net force where held, zero where free."""
+        free = self.free_masks(state.dim)
+        force = self.force(state)
+        return Vector(
+            tuple(jnp.zeros_like(f) if m is None else jnp.where(m, jnp.zeros_like(f), -f) for f, m in zip(force, free, strict=True))
+        )
+
+    def hold(self, v: Vector) -> Vector:
+        """`v` where free, zero where held."""
+        return Vector(tuple(a if m is None else jnp.where(m, a, jnp.zeros_like(a)) for a, m in zip(v, self.free_masks(v.dim), strict=True)))
+
+    def constrain(self, state: State) -> State:
+        """The state with held nodes at rest and moved nodes on their schedule."""
+        state = eqx.tree_at(lambda s: s.velocity, state, self.hold(state.velocity))
+        if self.motion is None:
+            return state
+        position, velocity = self.motion.at(state.time)
+        moved = self.motion.moved
+
+        def pick(new: Vector, old: Vector) -> Vector:
+            return old.map(lambda a, b: jnp.where(moved, b.astype(a.dtype), a), new)
+
+        return eqx.tree_at(lambda s: (s.position, s.velocity), state, (pick(position, state.position), pick(velocity, state.velocity)))
+
+    def energy(self, state: State) -> Energy:
+        """Kinetic energy and each force's potential [J]."""
+        kinetic = 0.5 * jnp.sum(self.mass.astype(state.dtype) * state.velocity.dot(state.velocity))
+        return Energy(kinetic, tuple(f.with_mass(self.mass).energy(state) for f in self.forces))
+
+    def momentum(self, state: State) -> Array:
+        """(D,) total momentum [kg m/s]."""
+        return jnp.stack([jnp.sum(self.mass.astype(state.dtype) * a) for a in state.velocity])
+
+    def angular_momentum(self, state: State) -> Array:
+        """About the origin [kg m^2/s]: (3,) in space, (1,) in the plane."""
+        m, x, p = self.mass.astype(state.dtype), state.position, state.velocity
+        if state.dim == 1:
+            raise ValueError("Angular momentum needs 2 or 3 coordinates; these positions have 1.")
+        pairs = [(0, 1)] if state.dim == 2 else [(1, 2), (2, 0), (0, 1)]
+        return jnp.stack([jnp.sum(m * (x[i] * p[j] - x[j] * p[i])) for i, j in pairs])
+
+    def free_masks(self, dim: int) -> tuple[Array | None, ...]:
+        """Per coordinate, where nodes are free (None: all are)."""
+        free = self.free if isinstance(self.free, tuple) else (self.free,) * dim
+        if len(free) != dim:
+            raise ValueError(f"free has {len(free)} coordinates, the state has {dim}.")
+        if self.motion is None:
+            return free
+        still = ~self.motion.moved
+        return tuple(still if m is None else m & still for m in free)
+
+
+def lumped_mass(net: Topology, points: Any, density: Any, triangles: Any = None) -> Array:
+    """(N,) node masses [kg] from a density, in the user's order.
+
+    Along springs (density [kg/m]) each spring gives half its mass to either end. With triangles (density [kg/m^2]) each triangle gives
+    a third to each corner.
+
+    Args:
+        net: the topology.
+        points: (N, D) rest positions [m].
+        density: one number.
+        triangles: (T, 3) node numbers, or None for a density along springs.
+    """
+    density = as_inexact("density", density)
+    positive("density", density, "A node without mass would get an infinite acceleration.")
+    points = as_inexact("points", points)
+    if triangles is None:
+        lengths = net.lengths(points)
+        return net.flatten_nodes(net.incident_sum(net.split(0.5 * density * lengths)))
+    corners = np.asarray(triangles)
+    a, b, c = (points[corners[:, i]] for i in range(3))
+    u, v = b - a, c - a
+    squared = jnp.sum(u * u, axis=1) * jnp.sum(v * v, axis=1) - jnp.sum(u * v, axis=1) ** 2
+    share = density * jnp.sqrt(jnp.maximum(squared, jnp.zeros((), squared.dtype))) / 6
+    return jnp.zeros(net.n_nodes, points.dtype).at[corners.ravel()].add(jnp.repeat(share, 3))
+
+
+def _as_free(net: Topology, free: Any) -> Free:
+    if free is None:
+        return None
+    if not hasattr(free, "dtype"):
+        free = np.asarray(free)
+    if free.dtype != np.bool_:
+        raise TypeError(f"free has dtype {free.dtype}; expected booleans: True moves, False is held. Node numbers are not accepted.")
+    if len(shape_of(free)) == 2 and free.shape != net.node_shape:
+        has_shape("free", free, {"per node": (net.n_nodes,), "per node and coordinate": (net.n_nodes, min(free.shape[1], 3))})
+        return tuple(net.node_field(free[:, i], "free") for i in range(free.shape[1]))
+    return net.node_field(free, "free")

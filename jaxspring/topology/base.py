@@ -1,0 +1,154 @@
+"""What every topology offers: differences along springs, and pulls gathered on nodes.
+
+    d = D x        difference: head minus tail, per spring
+    f = -D' p      accumulate: a pull p acts on the tail, its opposite on the head
+
+`D` and `D'` are each other's transpose. No file outside `topology/` gathers or scatters along springs.
+"""
+
+from __future__ import annotations
+
+import abc
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .._checks import as_inexact, finite, has_shape, shape_of
+from ..vector import Vector
+from .edge_field import EdgeField
+from .permutation import Permutation
+
+
+@dataclass(frozen=True)
+class NodeLayout:
+    """Shape and order in which node fields are stored."""
+
+    shape: tuple[int, ...]
+    permutation: Permutation | None
+
+    def flatten(self, a: Array) -> Array:
+        """Node array, leading axes allowed -> (..., N) in the user's order."""
+        flat = a.reshape(*a.shape[: a.ndim - len(self.shape)], math.prod(self.shape))
+        return flat if self.permutation is None else self.permutation.outward(flat)
+
+    def unflatten(self, flat: Array) -> Array:
+        """(N,) in the user's order -> node array."""
+        return (flat if self.permutation is None else self.permutation.inward(flat)).reshape(self.shape)
+
+
+class Topology(eqx.Module):
+    """Which nodes exist and which springs join them. Abstract: see `Lattice` and `Graph`."""
+
+    @property
+    @abc.abstractmethod
+    def node_shape(self) -> tuple[int, ...]:
+        """Shape of a node field: (ny, nx) on a lattice, (N,) on a graph."""
+
+    @property
+    @abc.abstractmethod
+    def edges(self) -> np.ndarray:
+        """(E, 2) integer array, tail and head node of each spring, in the user's order and numbering."""
+
+    @property
+    @abc.abstractmethod
+    def family_shapes(self) -> tuple[tuple[int, ...], ...]:
+        """Shape of each entry of an edge field."""
+
+    @property
+    @abc.abstractmethod
+    def node_permutation(self) -> Permutation | None:
+        """From the user's node order to the internal one, or None where the two agree."""
+
+    @abc.abstractmethod
+    def difference(self, x: Vector) -> EdgeField:
+        """Head minus tail of `x` along each spring (minimum image where the topology is periodic)."""
+
+    @abc.abstractmethod
+    def accumulate(self, pulls: EdgeField) -> Vector:
+        """Force on each node from the pull of each spring: plus on its tail, minus on its head."""
+
+    @abc.abstractmethod
+    def incident_sum(self, values: EdgeField) -> Array:
+        """Sum over the springs at each node, whichever end: node shape."""
+
+    @abc.abstractmethod
+    def average(self, a: Array) -> EdgeField:
+        """Mean of a node array over the two ends of each spring."""
+
+    @abc.abstractmethod
+    def split(self, flat: Array) -> EdgeField:
+        """(E,) array in the user's order -> edge field."""
+
+    @abc.abstractmethod
+    def flatten(self, field: EdgeField) -> Array:
+        """Edge field -> (E,) array in the user's order."""
+
+    @property
+    def layout(self) -> NodeLayout:
+        """How node fields are stored; a `State` keeps it to give points back in the user's order."""
+        return NodeLayout(self.node_shape, self.node_permutation)
+
+    @property
+    def n_nodes(self) -> int:
+        """Number of nodes N."""
+        return int(np.prod(self.node_shape))
+
+    @property
+    def n_springs(self) -> int:
+        """Number of springs E."""
+        return sum(int(np.prod(shape)) for shape in self.family_shapes)
+
+    def map_springs(self, law: Callable[..., Any], *fields: Any) -> EdgeField:
+        """Call `law` once per spring family; a number or 0-d array is passed to every family as it is."""
+        count = len(self.family_shapes)
+        columns = [f.families if isinstance(f, EdgeField) else (f,) * count for f in fields]
+        return EdgeField(tuple(law(*entries) for entries in zip(*columns, strict=True)))
+
+    def edge_field(self, value: Any, name: str = "value") -> Array | EdgeField:
+        """A number, an (E,) array in the user's order, or an edge field, in the shape of the topology.
+
+        A number stays a 0-d array. Raises ValueError where the shape fits neither.
+        """
+        if isinstance(value, EdgeField):
+            shapes = tuple(shape_of(entry) for entry in value.families)
+            if shapes != self.family_shapes:
+                raise ValueError(f"{name} is an edge field of shapes {shapes}; this topology has {self.family_shapes}.")
+            return value
+        value = as_inexact(name, value)
+        has_shape(name, value, {"one number": (), "one per spring": (self.n_springs,)})
+        return self.split(value) if value.ndim else value
+
+    def node_field(self, value: Any, name: str = "value") -> Array:
+        """A number, an (N,) array in the user's order, or an array in node shape, as a node array (a number stays 0-d)."""
+        value = jnp.asarray(value)
+        allowed = {"one number": (), "one per node": (self.n_nodes,), "node shape": self.node_shape}
+        has_shape(name, value, allowed)
+        if value.ndim == 0 or (value.shape == self.node_shape and self.node_permutation is None):
+            return value
+        return self._order_nodes(value)
+
+    def vector_field(self, points: Any, name: str = "points") -> Vector:
+        """(N, D) array in the user's order -> `Vector` in node shape, D = 1, 2 or 3."""
+        points = as_inexact(name, points)
+        if points.ndim != 2 or points.shape[0] != self.n_nodes or points.shape[1] not in (1, 2, 3):
+            raise ValueError(f"{name} has shape {points.shape}; expected ({self.n_nodes}, D) with D = 1, 2 or 3 coordinates.")
+        finite(name, points)
+        return Vector(tuple(self._order_nodes(points[:, i]) for i in range(points.shape[1])))
+
+    def flatten_nodes(self, a: Array) -> Array:
+        """Node array (leading axes allowed) -> (..., N) in the user's order."""
+        return self.layout.flatten(a)
+
+    def lengths(self, position: Any) -> Array:
+        """(E,) lengths of the springs [m] in the user's order, for a `Vector` or an (N, D) array of positions."""
+        x = position if isinstance(position, Vector) else self.vector_field(position, "position")
+        return self.flatten(self.difference(x).map(lambda d: d.norm()))
+
+    def _order_nodes(self, flat: Array) -> Array:
+        return self.layout.unflatten(flat)

@@ -1,0 +1,79 @@
+"""A value on every spring, kept in the topology's own shape: one entry per spring family."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._checks import shape_of
+
+
+class EdgeField(eqx.Module):
+    """A value (an array, or a `Vector` of arrays) on every spring.
+
+    On a lattice there is one entry per spring family, in the shape of that family's tails; on a graph a single entry of shape (E,).
+    Arithmetic is elementwise with another field or with a number.
+
+    Attributes:
+        families: tuple with one entry per spring family.
+    """
+
+    families: tuple[Any, ...]
+
+    __array_ufunc__ = None
+
+    def map(self, function: Callable[..., Any], *others: EdgeField) -> EdgeField:
+        """Apply `function` to each family (and those of `others`)."""
+        return EdgeField(tuple(function(*entries) for entries in zip(self.families, *(o.families for o in others), strict=True)))
+
+    def sum(self) -> Any:
+        """Sum over all springs."""
+        return sum((jnp.sum(entry) for entry in self.families[1:]), start=jnp.sum(self.families[0]))
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter(self.families)
+
+    def __len__(self) -> int:
+        return len(self.families)
+
+    def __getitem__(self, index: int) -> Any:
+        return self.families[index]
+
+    def __neg__(self) -> EdgeField:
+        return self.map(lambda a: -a)
+
+    def __add__(self, other: Any) -> EdgeField:
+        return self._combine(lambda a, b: a + b, other)
+
+    def __sub__(self, other: Any) -> EdgeField:
+        return self._combine(lambda a, b: a - b, other)
+
+    def __rsub__(self, other: Any) -> EdgeField:
+        return self._combine(lambda a, b: b - a, other)
+
+    def __mul__(self, other: Any) -> EdgeField:
+        return self._combine(lambda a, b: a * b, other)
+
+    def __truediv__(self, other: Any) -> EdgeField:
+        return self._combine(lambda a, b: a / b, other)
+
+    __radd__ = __add__
+    __rmul__ = __mul__
+
+    def _combine(self, operation: Callable[[Any, Any], Any], other: Any) -> EdgeField:
+        if isinstance(other, EdgeField):
+            return self.map(operation, other)
+        if not (isinstance(other, (int, float, np.ndarray, np.generic)) or eqx.is_array(other)):
+            return NotImplemented
+        if shape_of(other):
+            raise TypeError(
+                f"An EdgeField was combined with an array of shape {shape_of(other)}. Convert it first: network.edge_field(array)."
+            )
+        if isinstance(other, (np.ndarray, np.generic)):
+            other = jnp.asarray(other, jax.tree.leaves(self.families)[0].dtype)
+        return self.map(lambda entry: operation(entry, other))

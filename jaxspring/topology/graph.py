@@ -1,0 +1,145 @@
+"""Irregular networks: any list of springs between nodes.
+
+Nodes and springs are renumbered inside for locality; the user's numbering is kept outside. A node field has shape (N,), an edge
+field holds one entry of shape (E,). How pulls are summed on nodes is an object, `Gather` or `Scatter`: see `reduction.py`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int
+
+from .._checks import node_indices
+from ..vector import Vector
+from .base import Topology
+from .edge_field import EdgeField
+from .lattice import _as_box, minimum_image
+from .permutation import Permutation
+from .reduction import Gather, Reduction, Scatter, choose_reduction
+
+
+class Graph(Topology):
+    """Nodes joined by an arbitrary list of springs. Build it with `Graph.from_edges`, `delaunay` or `from_triangles`.
+
+    Attributes:
+        tails: (E,) internal number of each spring's tail node.
+        heads: (E,) internal number of each spring's head node.
+        reduction: how pulls are summed on nodes.
+        box: (D,) period of each coordinate [m], or None.
+        triangles: (T, 3) triangles in the user's numbering, or None.
+    """
+
+    tails: Int[Array, " E"]
+    heads: Int[Array, " E"]
+    reduction: Reduction
+    box: Array | None
+    triangles: np.ndarray | None
+    count: int = eqx.field(static=True)
+    nodes: Permutation = eqx.field(static=True)
+    springs: Permutation = eqx.field(static=True)
+
+    @staticmethod
+    def from_edges(
+        edges: Any, n_nodes: int, *, box: Any = None, triangles: Any = None, reduction: type[Gather] | type[Scatter] | None = None
+    ) -> Graph:
+        """A network from an (E, 2) integer array: tail and head node of each spring. Springs may be repeated.
+
+        Args:
+            edges: (E, 2) node numbers.
+            n_nodes: number of nodes N; a node without a spring is allowed.
+            box: (D,) period of each coordinate [m]; zero where a coordinate is not periodic.
+            triangles: (T, 3) triangles, kept for plots and surfaces.
+            reduction: `Gather` (no scatter in any program) or `Scatter`; None chooses by size and platform.
+
+        Raises:
+            ValueError: no node, a node that does not exist, a spring that joins a node to itself.
+            TypeError: node numbers that are not integers.
+
+        >>> net = Graph.from_edges([(0, 1), (1, 2)], n_nodes=3)
+        >>> net.n_springs
+        2
+        """
+        if n_nodes < 1:
+            raise ValueError(f"n_nodes = {n_nodes}, but a network needs at least 1 node.")
+        pairs = node_indices("edges", edges, n_nodes)
+        nodes = Permutation(_locality_order(pairs, n_nodes))
+        inner = nodes.inverse[pairs]
+        springs = Permutation(np.lexsort((inner.max(axis=1), inner.min(axis=1))))
+        tails, heads = (np.ascontiguousarray(column) for column in inner[springs.order].T)
+        kind = reduction or choose_reduction(n_nodes, len(pairs))
+        return Graph(
+            tails=jnp.asarray(tails),
+            heads=jnp.asarray(heads),
+            reduction=kind.build(tails, heads, n_nodes),
+            box=_as_box(box),
+            triangles=None if triangles is None else np.asarray(triangles, np.int32),
+            count=int(n_nodes),
+            nodes=nodes,
+            springs=springs,
+        )
+
+    @property
+    def node_shape(self) -> tuple[int, ...]:
+        """(N,)"""
+        return (self.count,)
+
+    @property
+    def family_shapes(self) -> tuple[tuple[int, ...], ...]:
+        """((E,),)"""
+        return (self.tails.shape,)
+
+    @property
+    def node_permutation(self) -> Permutation:
+        """From the user's node order to the internal one."""
+        return self.nodes
+
+    @property
+    def edges(self) -> np.ndarray:
+        """(E, 2) tail and head of each spring, in the user's order and numbering."""
+        inner = np.stack([np.asarray(self.tails), np.asarray(self.heads)], axis=-1)
+        return self.nodes.order[inner][self.springs.inverse]
+
+    def difference(self, x: Vector) -> EdgeField:
+        """Head minus tail along each spring."""
+        d = self._per_array(self.reduction.difference, x)
+        return EdgeField((d if self.box is None else minimum_image(d, self.box),))
+
+    def accumulate(self, pulls: EdgeField) -> Vector:
+        """Force on each node: each pull on its tail, the opposite on its head."""
+        return self._per_array(self.reduction.accumulate, pulls.families[0])
+
+    def incident_sum(self, values: EdgeField) -> Array:
+        """Sum over the springs at each node."""
+        return self.reduction.sum_at_nodes(values.families[0], self.tails, self.heads)
+
+    def average(self, a: Array) -> EdgeField:
+        """Mean of a node array over the two ends of each spring."""
+        return EdgeField((self.reduction.mean_of_ends(a, self.tails, self.heads),))
+
+    def split(self, flat: Array) -> EdgeField:
+        """(E,) array in the user's order -> edge field."""
+        return EdgeField((self.springs.inward(flat),))
+
+    def flatten(self, field: EdgeField) -> Array:
+        """Edge field -> (E,) array in the user's order."""
+        return self.springs.outward(field.families[0])
+
+    def _per_array(self, function: Callable[[Array, Array, Array], Array], v: Vector) -> Vector:
+        return v.map(lambda a: function(a, self.tails, self.heads))
+
+
+def _locality_order(pairs: np.ndarray, n_nodes: int) -> np.ndarray:
+    """Reverse Cuthill-McKee order: joined nodes get near numbers, so that gathers stay in cache."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+    if not len(pairs):
+        return np.arange(n_nodes, dtype=np.int32)
+    both = np.concatenate([pairs, pairs[:, ::-1]])
+    matrix = coo_array((np.ones(len(both), np.int8), (both[:, 0], both[:, 1])), shape=(n_nodes, n_nodes)).tocsr()
+    return np.asarray(reverse_cuthill_mckee(matrix, symmetric_mode=True), np.int32)

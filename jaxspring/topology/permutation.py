@@ -1,0 +1,47 @@
+"""A fixed reordering, applied as a pair of gathers.
+
+`a[order]` alone puts a scatter into the gradient. Here the transpose of one gather is the other gather.
+"""
+
+from __future__ import annotations
+
+import hashlib
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..numerics import linear_call
+
+
+class Permutation:
+    """`order[i]` is the user's number of internal item `i`; compared and hashed by content, so that it can be static under `jit`."""
+
+    def __init__(self, order: np.ndarray):
+        self.order = np.asarray(order, np.int32)
+        self.inverse = np.argsort(self.order).astype(np.int32)
+        self._digest = hashlib.sha256(self.order.tobytes()).hexdigest()
+
+    def __hash__(self) -> int:
+        return hash(self._digest)
+
+    def __eq__(self, other: object) -> bool:
+        return self is other or (isinstance(other, Permutation) and self._digest == other._digest)
+
+    def __repr__(self) -> str:
+        return f"Permutation(size={self.order.size})"
+
+    def inward(self, a: Array) -> Array:
+        """User's order -> internal order, along the last axis."""
+        return _gather_pair(a, self.order, self.inverse)
+
+    def outward(self, a: Array) -> Array:
+        """Internal order -> user's order, along the last axis."""
+        return _gather_pair(a, self.inverse, self.order)
+
+
+def _gather_pair(a: Array, forward: np.ndarray, backward: np.ndarray) -> Array:
+    if not jnp.issubdtype(a.dtype, jnp.inexact):
+        return a[..., forward]
+    tables = (jnp.asarray(forward), jnp.asarray(backward))
+    return linear_call(lambda t, x: x[..., t[0]], lambda t, y: y[..., t[1]], tables, a)

@@ -1,0 +1,115 @@
+"""Looking for trouble during a rollout: once per block, and a replay of the failed block to name the step.
+
+The watch costs one check of the state per block, and a copy of the carry at the start of the first block that failed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from .numerics import stopped
+from .state import State
+from .status import NOWHERE, Flag, Status
+from .system import System
+
+
+class Carry(eqx.Module):
+    """What goes from step to step: the state, what the stepper carries, and how many steps were done."""
+
+    state: State
+    memory: Any
+    step: Array
+
+
+class Watch(eqx.Module):
+    """What the checks have seen so far.
+
+    Attributes:
+        status: joined statuses of all checks.
+        suspect: the carry at the start of the first block that ended with a NaN or an infinity.
+    """
+
+    status: Status
+    suspect: Carry
+
+
+def begin(system: System, carry: Carry, dt: Array, limit: Array | None) -> Watch:
+    """Before the first step: constants that a constructor would refuse, a state that is not finite, a dt above the limit."""
+    status = Status.ok()
+    for i, effect in enumerate(system.forces):
+        bad = effect.invalid()
+        if bad is not None:
+            status = status.then(Status.when(Flag.INVALID, bad, step=carry.step, effect=i))
+    status = status.then(Status.when(Flag.INVALID, ~jnp.all(system.mass > 0), step=carry.step))
+    status = status.then(look(system, carry))
+    if limit is not None:
+        # A hair of slack: a dt set to the limit itself is not above it after rounding.
+        slack = jnp.asarray(1 + 8 * float(jnp.finfo(limit.dtype).eps), limit.dtype)
+        status = status.then(Status.when(Flag.DT_LIMIT, jnp.abs(dt) > limit * slack, step=carry.step))
+    is_first = carry.step == 0
+    status = jax.tree.map(lambda seen, ok: jnp.where(is_first, seen, ok), status, Status.ok())
+    return lax.stop_gradient(Watch(status, carry))
+
+
+def inspect(system: System, before: Carry, after: Carry, watch: Watch) -> Watch:
+    """The watch brought up to date at the end of a block that began at `before`."""
+    seen = look(system, after)
+    is_first = seen.has(Flag.NONFINITE) & ~watch.status.has(Flag.NONFINITE)
+    suspect = jax.tree.map(lambda new, old: jnp.where(is_first, new, old), lax.stop_gradient(before), watch.suspect)
+    return Watch(watch.status.then(seen), suspect)
+
+
+def look(system: System, carry: Carry) -> Status:
+    """Status of one state: is it finite, and what the effects have to report."""
+    system, state = stopped((system, carry.state))
+    bad = _nonfinite(state)
+    node = jnp.argmax(jnp.ravel(bad))
+    status = Status.when(Flag.NONFINITE, jnp.any(bad), step=carry.step, node=node, count=jnp.sum(bad))
+    for i, effect in enumerate(system.forces):
+        for found in effect.diagnose(state):
+            raised = Status.when(found.flag, found.count > 0, step=carry.step, node=found.node, effect=i, count=found.count)
+            status = status.then(raised)
+    return status
+
+
+def settle(advance: Callable[[Carry], Carry], watch: Watch, system: System) -> Status:
+    """The final status: where a block failed, it is replayed to name the step, the node and the effect."""
+    status = watch.status
+
+    def replay(_: None) -> tuple[Array, Array, Array]:
+        last, first = lax.while_loop(
+            lambda pair: ~jnp.any(_nonfinite(pair[1].state)) & (pair[1].step < status.step),
+            lambda pair: (pair[1], advance(pair[1])),
+            (watch.suspect, advance(watch.suspect)),
+        )
+        node = jnp.argmax(jnp.ravel(_nonfinite(first.state)))
+        return first.step, node.astype(jnp.int32), _blame(system, last.state)
+
+    failed = status.has(Flag.NONFINITE) & (status.step > 0)
+    known = (status.step, status.node, status.effect)
+    step, node, effect = lax.cond(failed, replay, lambda _: known, None)
+    return lax.stop_gradient(Status(status.flags, step, node, effect, status.count))
+
+
+def _blame(system: System, state: State) -> Array:
+    """Index of the first effect whose force is not finite in this state, else -1."""
+    effect = jnp.asarray(NOWHERE, jnp.int32)
+    for i, force in reversed(list(enumerate(system.forces))):
+        bad = jnp.any(jnp.stack([~jnp.all(jnp.isfinite(a)) for a in force.force(state)]))
+        effect = jnp.where(bad, jnp.asarray(i, jnp.int32), effect)
+    return effect
+
+
+def _nonfinite(state: State) -> Array:
+    bad = [~jnp.isfinite(a) for v in (state.position, state.velocity) for a in v]
+    total = bad[0]
+    for more in bad[1:]:
+        total = total | more
+    return total

@@ -44,7 +44,7 @@ def imports(path: pathlib.Path) -> list[tuple[str, int, bool]]:
     for node in ast.walk(syntax):
         if isinstance(node, ast.FunctionDef | ast.Lambda) or (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)):
             late.update(id(inner) for inner in ast.walk(node))
-    found = []
+    found = set()
     for node in ast.walk(syntax):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
@@ -53,8 +53,8 @@ def imports(path: pathlib.Path) -> list[tuple[str, int, bool]]:
             names = [f"{base}.{alias.name}" if f"{base}.{alias.name}" in known else base for alias in node.names]
         else:
             continue
-        found += [(name, node.lineno, id(node) not in late) for name in names]
-    return found
+        found.update((name, node.lineno, id(node) not in late) for name in names)
+    return sorted(found, key=lambda entry: entry[1])
 
 
 def absolute(node: ast.ImportFrom, path: pathlib.Path) -> str:

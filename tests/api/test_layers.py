@@ -23,6 +23,9 @@ LAYERS = {
     "stability": 4,
     "steppers": 5,
     "equilibrium": 5,
+    "watch": 6,  # watch, blocks and progress are the parts of a rollout
+    "blocks": 6,
+    "progress": 6,
     "rollout": 6,
     "ode": 6,
     "inverse": 7,

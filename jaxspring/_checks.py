@@ -94,7 +94,9 @@ def node_indices(name: str, edges: Any, n_nodes: int) -> np.ndarray:
     if array.size == 0:
         return np.zeros((0, 2), np.int32)
     if array.dtype == np.bool_ or not np.issubdtype(array.dtype, np.integer):
-        raise TypeError(f"{name} has dtype {array.dtype}; expected integer node numbers. JAX would read a bool as a mask.")
+        raise TypeError(
+            f"{name} has dtype {array.dtype}, e.g. {name}[0] = {array[0]}; expected integer node numbers. JAX would read a bool as a mask."
+        )
     if array.ndim != 2 or array.shape[1] != 2:
         raise ValueError(f"{name} has shape {array.shape}; expected (E, 2): tail and head node of each spring.")
     bad = (array < 0) | (array >= n_nodes)

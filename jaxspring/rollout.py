@@ -125,6 +125,8 @@ def rollout(
     if bool(result.status.has(Flag.DT_LIMIT)):
         text = f"dt = {float(dt):.6g} s, but this run is surely stable only up to {float(result.info.stable_dt):.6g} s"
         warnings.warn(f"DT_LIMIT: {EXPLANATION[Flag.DT_LIMIT]}: {text}.", StabilityWarning, stacklevel=2)
+    if bool(result.status.has(Flag.PRECISION)):
+        warnings.warn(f"PRECISION: {EXPLANATION[Flag.PRECISION]}.", StabilityWarning, stacklevel=2)
     return result
 
 
@@ -141,7 +143,7 @@ def _run(
     """The whole run as one traced program."""
     ready = system.prepare(state.dtype)
     start = ready.constrain(state)
-    limit = dt_limit(ready, start, stepper)
+    limit = dt_limit(*stopped((ready, start)), stepper)
     memory = stepper.init(ready, start) if isinstance(resume.memory, _Unset) else resume.memory
     carry = Carry(start, memory, resume.step)
 
@@ -159,11 +161,20 @@ def _run(
     return Result(
         state=carry.state,
         saved=saved,
-        status=settle(partial(_advance, still, stepper, still_dt, still_time), watch, still),
+        status=_in_user_order(settle(partial(_advance, still, stepper, still_dt, still_time), watch, still), state),
         info=Info(limit, carry.step),
         resume=Resume(resume.start_time, carry.step, carry.memory),
         effects=tuple(type(f).__name__ for f in system.forces),
     )
+
+
+def _in_user_order(status: Status, state: State) -> Status:
+    """The status naming the node by the user's number, where the topology has its own."""
+    permutation = state.layout.permutation
+    if permutation is None:
+        return status
+    named = jnp.asarray(permutation.order)[jnp.maximum(status.node, 0)]
+    return eqx.tree_at(lambda s: s.node, status, jnp.where(status.node >= 0, named, status.node))
 
 
 def _advance(system: System, stepper: Stepper, dt: Array, start_time: Array, carry: Carry) -> Carry:

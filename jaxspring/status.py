@@ -36,9 +36,11 @@ class Flag(enum.IntFlag):
     INTERRUPTED = 4096
     DT_LIMIT = 8192
     INVALID = 16384
+    SOLVER = 32768
+    PRECISION = 32768
 
 
-WARNINGS = Flag.COINCIDENT | Flag.OVERLAP | Flag.OUTSIDE | Flag.DT_LIMIT
+WARNINGS = Flag.COINCIDENT | Flag.OVERLAP | Flag.OUTSIDE | Flag.DT_LIMIT | Flag.PRECISION
 
 EXPLANATION = {
     Flag.NONFINITE: "a position or velocity is NaN or infinite; try a smaller dt (see stable_dt), or look for a bad parameter",
@@ -55,6 +57,8 @@ EXPLANATION = {
     Flag.MAX_STEPS: "the adaptive solver ran out of steps; raise max_steps or loosen the tolerance",
     Flag.INTERRUPTED: "interrupted; the result holds what was done until then",
     Flag.DT_LIMIT: "dt is above the stability limit of this stepper (see stable_dt)",
+    Flag.PRECISION: "rounding of such large coordinates spoils the springs' forces; move the scene to the origin, or use float64",
+    Flag.SOLVER: "the solver gave up: its nonlinear solve did not converge, or its step shrank to the least allowed",
     Flag.INVALID: "a parameter has a value that its constructor would refuse (sign, NaN or infinity)",
 }
 
@@ -67,7 +71,7 @@ class Status(eqx.Module):
     Attributes:
         flags: bit mask of `Flag`; 0 is OK.
         step: step at whose end the first trouble was seen (0: before the first step; -1: no trouble).
-        node: node concerned, in the topology's own flat order (-1: none in particular).
+        node: node concerned, in the user's order (-1: none in particular).
         effect: index into the system's forces (-1: none in particular).
         count: how many nodes or springs were concerned.
     """

@@ -96,6 +96,10 @@ class System(eqx.Module):
         self.free = _as_free(net, free)
         self.motion = motion
 
+    def _cast(self, effect: Force, state: State) -> Force:
+        """The effect with its masses, and constants of the state's dtype: float32 in, float32 out, whatever the constants were."""
+        return cast_inexact(effect.with_mass(self.mass), state.dtype)
+
     def _adopt(self, i: int, force: Any) -> Force:
         if not isinstance(force, Force):
             raise TypeError(f"forces[{i}] is a {type(force).__name__}; expected a Force, e.g. Springs(net, ...) or Drag(gamma).")
@@ -113,7 +117,7 @@ class System(eqx.Module):
         """Sum of all forces on each node [N], also where it is held (there it is what the hold must balance)."""
         total = None
         for effect in self.forces:
-            f = effect.with_mass(self.mass).force(state)
+            f = self._cast(effect, state).force(state)
             total = f if total is None else total + f
         return Vector.zeros_like(state.position) if total is None else total
 
@@ -149,7 +153,7 @@ class System(eqx.Module):
     def energy(self, state: State) -> Energy:
         """Kinetic energy and each force's potential [J]."""
         kinetic = 0.5 * jnp.sum(self.mass.astype(state.dtype) * state.velocity.dot(state.velocity))
-        return Energy(kinetic, tuple(f.with_mass(self.mass).energy(state) for f in self.forces))
+        return Energy(kinetic, tuple(self._cast(f, state).energy(state) for f in self.forces))
 
     def momentum(self, state: State) -> Array:
         """(D,) total momentum [kg m/s]."""

@@ -41,13 +41,22 @@ class Watch(eqx.Module):
 
 
 def begin(system: System, carry: Carry, dt: Array, limit: Array | None) -> Watch:
-    """Before the first step: constants that a constructor would refuse, a state that is not finite, a dt above the limit."""
+    """Before the first step: constants that a constructor would refuse, a state that is not finite, a dt above the limit, and
+    coordinates too large for the springs between them.
+    """
+    system, carry, dt, limit = stopped((system, carry, dt, limit))
     status = Status.ok()
     for i, effect in enumerate(system.forces):
         bad = effect.invalid()
         if bad is not None:
             status = status.then(Status.when(Flag.INVALID, bad, step=carry.step, effect=i))
+        status = status.then(Status.when(Flag.NONFINITE, _has_nonfinite(effect), step=carry.step, effect=i))
+        rounding = effect.rounding(carry.state)
+        if rounding is not None:
+            # Forces good to three digits or worse: the threshold is a choice.
+            status = status.then(Status.when(Flag.PRECISION, rounding > 1e-3, step=carry.step, effect=i))
     status = status.then(Status.when(Flag.INVALID, ~jnp.all(system.mass > 0), step=carry.step))
+    status = status.then(Status.when(Flag.NONFINITE, _has_nonfinite(system.mass), step=carry.step))
     status = status.then(look(system, carry))
     if limit is not None:
         # A hair of slack: a dt set to the limit itself is not above it after rounding.
@@ -105,6 +114,13 @@ def _blame(system: System, state: State) -> Array:
         bad = jnp.any(jnp.stack([~jnp.all(jnp.isfinite(a)) for a in force.force(state)]))
         effect = jnp.where(bad, jnp.asarray(i, jnp.int32), effect)
     return effect
+
+
+def _has_nonfinite(constants: Any) -> Array:
+    bad = jnp.zeros((), bool)
+    for leaf in jax.tree.leaves(eqx.filter(constants, eqx.is_inexact_array)):
+        bad = bad | ~jnp.all(jnp.isfinite(leaf))
+    return bad
 
 
 def _nonfinite(state: State) -> Array:

@@ -29,6 +29,7 @@ from ..numerics import cast_inexact
 from ..state import State
 from ..topology.base import Topology
 from ..topology.edge_field import EdgeField
+from .base import any_refused
 from .springs import StiffnessRule
 
 
@@ -105,6 +106,10 @@ class ImageStiffness(StiffnessRule):
     def upper_bound(self) -> Array:
         """k_max [N/m]."""
         return self.k_max
+
+    def invalid(self) -> Array:
+        """Whether a constant is negative or not finite, or k_min is above k_max."""
+        return any_refused(self.k_min, self.k_max, self.sigma) | (self.k_min > self.k_max)
 
 
 __all__ = ["ImageStiffness"]

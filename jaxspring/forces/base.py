@@ -65,6 +65,10 @@ class Force(eqx.Module):
         """Lower bound of -dF/dv on every motion of a node [N s/m]; None where zero."""
         return None
 
+    def rounding(self, state: State) -> Array | None:
+        """Rounding error of a position, relative to the smallest length that the effect must resolve; None where it takes no difference."""
+        return None
+
     def diagnose(self, state: State) -> tuple[Finding, ...]:
         """What this effect has to report about a state: see `Finding`."""
         return ()
@@ -74,9 +78,9 @@ class Force(eqx.Module):
         return None
 
 
-def any_negative_or_nan(*values: Any) -> Array:
-    """True where any entry of any array is negative or NaN."""
+def any_refused(*values: Any) -> Array:
+    """True where any entry of any array is what a constructor refuses: negative, NaN or infinite."""
     bad = jnp.zeros((), bool)
     for leaf in jax.tree.leaves(values):
-        bad = bad | ~jnp.all(leaf >= 0)
+        bad = bad | ~jnp.all((leaf >= 0) & jnp.isfinite(leaf))
     return bad

@@ -20,7 +20,7 @@ from ..state import State
 from ..topology.base import Topology
 from ..topology.edge_field import EdgeField
 from ..vector import Vector
-from .base import Force, any_negative_or_nan
+from .base import Force, any_refused
 from .springs import _check_sign, _edge_constant
 
 
@@ -53,8 +53,8 @@ class Drag(Force):
         return self.gamma.astype(state.dtype)
 
     def invalid(self) -> Array:
-        """Whether gamma is negative or NaN."""
-        return any_negative_or_nan(self.gamma)
+        """Whether gamma is negative or not finite."""
+        return any_refused(self.gamma)
 
 
 class Dashpots(Force):
@@ -98,8 +98,8 @@ class Dashpots(Force):
         return 2 * self.net.incident_sum(self.net.map_springs(lambda one, c: one * c, spread, c))
 
     def invalid(self) -> Array:
-        """Whether a damper is negative or NaN."""
-        return any_negative_or_nan(self.damping)
+        """Whether a damper is negative or not finite."""
+        return any_refused(self.damping)
 
     def _rate(self, state: State) -> EdgeField:
         # A velocity is a difference of neighbouring images: it is never wrapped by a period.

@@ -24,7 +24,7 @@ from ..numerics import cast_inexact
 from ..state import State
 from ..status import Flag
 from ..vector import Vector
-from .base import Finding, Force, any_negative_or_nan
+from .base import Finding, Force, any_refused
 
 
 class DataSprings(Force):
@@ -84,8 +84,8 @@ class DataSprings(Force):
         return _outside(_surface(self), state)
 
     def invalid(self) -> Array:
-        """Whether the stiffness is negative or NaN."""
-        return any_negative_or_nan(self.stiffness)
+        """Whether the stiffness is negative or not finite."""
+        return any_refused(self.stiffness)
 
 
 class ImageAttraction(Force):

@@ -14,14 +14,14 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._checks import is_concrete, nonnegative
-from ..numerics import tiny
+from .._checks import finite, is_concrete, nonnegative
+from ..numerics import cast_inexact, tiny
 from ..state import State
 from ..status import Flag
 from ..topology.base import Topology
 from ..topology.edge_field import EdgeField
 from ..vector import Vector
-from .base import Finding, Force, any_negative_or_nan
+from .base import Finding, Force, any_refused
 from .laws import Hooke, Law, spring_energy, spring_pull
 
 
@@ -36,10 +36,12 @@ class StiffnessRule(eqx.Module):
     def upper_bound(self) -> Array:
         """The largest stiffness the rule can give [N/m], for `stable_dt`."""
 
+    def invalid(self) -> Array | None:
+        """Whether a constant has a value that the constructor would refuse."""
+        return None
+
     def prepare(self, net: Topology, dtype: Any) -> StiffnessRule:
         """The rule as the loop wants it: constants cast, tables made. Called once, before the loop."""
-        from ..numerics import cast_inexact
-
         return cast_inexact(self, dtype)
 
 
@@ -52,6 +54,7 @@ class Springs(Force):
         rest_length: l [m]: a number, (E,) or an `EdgeField`.
         law: the law of one spring; `Hooke()` unless said.
         axes: the coordinates the springs act in (None: all). `axes=(0, 1)` makes springs of the projection on the plane.
+        allow_negative_stiffness: accept stiffnesses below zero, which push without bound.
 
     Raises:
         ValueError: a negative or non-finite constant (named with its index), a shape that fits neither one number nor one per spring.
@@ -62,6 +65,7 @@ class Springs(Force):
     rest_length: Any
     law: Law
     axes: tuple[int, ...] | None = eqx.field(static=True)
+    allow_negative_stiffness: bool = eqx.field(static=True)
 
     def __init__(
         self,
@@ -77,16 +81,14 @@ class Springs(Force):
         self.rest_length = _edge_constant(net, "rest_length", rest_length)
         self.law = Hooke() if law is None else law
         self.axes = None if axes is None else tuple(int(a) for a in axes)
-        if not isinstance(stiffness, StiffnessRule) and not allow_negative_stiffness:
-            _check_sign(
-                "stiffness", self.stiffness, "A negative stiffness pushes without bound. Pass allow_negative_stiffness=True if meant."
-            )
+        self.allow_negative_stiffness = allow_negative_stiffness
+        if not isinstance(stiffness, StiffnessRule):
+            why = "A negative stiffness pushes without bound. Pass allow_negative_stiffness=True if meant."
+            _check_sign("stiffness", self.stiffness, why, any_sign=allow_negative_stiffness)
         _check_sign("rest_length", self.rest_length, "A length cannot be negative.")
 
     def prepare(self, dtype: Any) -> Springs:
         """Constants as edge fields of `dtype`."""
-        from ..numerics import cast_inexact
-
         rule = self.stiffness
         stiffness = rule.prepare(self.net, dtype) if isinstance(rule, StiffnessRule) else self.net.edge_field(rule, "stiffness")
         ready = eqx.tree_at(lambda s: (s.stiffness, s.rest_length), self, (stiffness, self.net.edge_field(self.rest_length, "rest_length")))
@@ -129,7 +131,7 @@ class Springs(Force):
         if self.net.n_springs == 0:
             return None
         k = self.stiffness.upper_bound() if isinstance(self.stiffness, StiffnessRule) else self.net.edge_field(self.stiffness)
-        k = self._steepest(state, k.astype(state.dtype) if not isinstance(k, EdgeField) else k)
+        k = self._steepest(state, cast_inexact(k, state.dtype))
         return 2 * self.net.incident_sum(k)
 
     def diagnose(self, state: State) -> tuple[Finding, ...]:
@@ -146,14 +148,43 @@ class Springs(Force):
         return (Finding(Flag.COINCIDENT, count, jnp.asarray(-1, jnp.int32)),)
 
     def invalid(self) -> Array | None:
-        """Whether a rest length is negative or a constant is NaN."""
-        return any_negative_or_nan(self.rest_length)
+        """Whether a constant is negative or not finite."""
+        rule = self.stiffness
+        bad = any_refused(self.rest_length, *(() if isinstance(rule, StiffnessRule) or self.allow_negative_stiffness else (rule,)))
+        by_rule = rule.invalid() if isinstance(rule, StiffnessRule) else None
+        return bad if by_rule is None else bad | by_rule
+
+    def rounding(self, state: State) -> Array | None:
+        """The largest coordinate's rounding over the smallest rest or present length. Springs without rest length pull by k d, whose
+        error is the same for short and long: they are measured by the longest of them.
+        """
+        if self.net.n_springs == 0:
+            return None
+        d, _, l = self._along(state)
+
+        def shortest(d: Vector, l: Array) -> Array:
+            length = d.norm()
+            never = jnp.full_like(length, jnp.inf)
+            return jnp.min(jnp.where(l > 0, jnp.minimum(jnp.where(length > 0, length, never), l), never))
+
+        def longest_without_rest(d: Vector, l: Array) -> Array:
+            length = d.norm()
+            return jnp.max(jnp.where(l > 0, jnp.zeros_like(length), length))
+
+        finest = jnp.min(jnp.stack(self.net.map_springs(shortest, d, l).families))
+        longest = jnp.max(jnp.stack(self.net.map_springs(longest_without_rest, d, l).families))
+        length = jnp.where(longest > 0, jnp.minimum(finest, longest), finest)
+        largest = jnp.max(jnp.stack([jnp.max(jnp.abs(a)) for a in self._seen(state)]))
+        return largest * jnp.asarray(jnp.finfo(state.dtype).eps, state.dtype) / length
+
+    def _seen(self, state: State) -> Vector:
+        return state.position if self.axes is None else Vector(tuple(state.position[a] for a in self.axes))
 
     def _along(self, state: State) -> tuple[EdgeField, Array | EdgeField, Array | EdgeField]:
-        x = state.position if self.axes is None else Vector(tuple(state.position[a] for a in self.axes))
         rule = self.stiffness
         k = rule.stiffness(self.net, state) if isinstance(rule, StiffnessRule) else self.net.edge_field(rule, "stiffness")
-        return self.net.difference(x), k, self.net.edge_field(self.rest_length, "rest_length")
+        k, l = cast_inexact((k, self.net.edge_field(self.rest_length, "rest_length")), state.dtype)
+        return self.net.difference(self._seen(state)), k, l
 
     def _embed(self, force: Vector, state: State) -> Vector:
         if self.axes is None:
@@ -187,7 +218,11 @@ def _edge_constant(net: Topology, name: str, value: Any) -> Any:
     return value
 
 
-def _check_sign(name: str, value: Any, why: str) -> None:
+def _check_sign(name: str, value: Any, why: str, any_sign: bool = False) -> None:
     entries = value.families if isinstance(value, EdgeField) else (value,)
     for i, entry in enumerate(entries):
-        nonnegative(f"{name}.families[{i}]" if isinstance(value, EdgeField) else name, entry, why)
+        place = f"{name}.families[{i}]" if isinstance(value, EdgeField) else name
+        if any_sign:
+            finite(place, entry)
+        else:
+            nonnegative(place, entry, why)

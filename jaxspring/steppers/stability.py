@@ -38,14 +38,14 @@ def stable_dt(system: System, state: State, stepper: Stepper | None = None) -> A
     2.0
     """
     stepper = SymplecticEuler() if stepper is None else stepper
-    limit = stepper.limit(*_bounds(system, state))
+    limit = dt_limit(system.prepare(state.dtype), state, stepper)
     if limit is None:
         raise TypeError(f"{type(stepper).__name__} has no known stability limit (its `limit` returns None).")
     return limit
 
 
 def dt_limit(system: System, state: State, stepper: Stepper) -> Array | None:
-    """As `stable_dt`, but None for a stepper that does not know its limit."""
+    """As `stable_dt`, for a prepared system; None for a stepper that does not know its limit."""
     return stepper.limit(*_bounds(system, state))
 
 

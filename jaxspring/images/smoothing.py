@@ -81,12 +81,10 @@ def _gaussian_band(deviation: Array, radius: int) -> Array:
     square = jnp.square(deviation)
     is_wide = square > _IDENTITY_DEVIATION**2
     exponent = 0.5 / jnp.where(is_wide, square, _IDENTITY_DEVIATION**2)
-
-    def weight(distance: np.ndarray) -> Array:
-        is_kept = (distance == 0) | (is_wide & (distance <= radius))
-        return jnp.where(is_kept, jnp.exp(-exponent * np.square(distance).astype(deviation.dtype)), 0)
-
-    band = weight(band_distance(radius)) / jnp.sum(weight(np.arange(-radius, radius + 1)))
+    distance = band_distance(radius)
+    is_kept = (distance == 0) | (is_wide & (distance <= radius))
+    weight = jnp.where(is_kept, jnp.exp(-exponent * np.square(distance).astype(deviation.dtype)), 0)
+    band = weight / jnp.sum(weight, axis=0, keepdims=True)
     return jnp.where(2 * jnp.abs(deviation) <= radius * (1 + 1e-5), band, jnp.nan)
 
 

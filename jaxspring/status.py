@@ -36,8 +36,8 @@ class Flag(enum.IntFlag):
     INTERRUPTED = 4096
     DT_LIMIT = 8192
     INVALID = 16384
-    SOLVER = 32768
     PRECISION = 32768
+    SOLVER = 65536
 
 
 WARNINGS = Flag.COINCIDENT | Flag.OVERLAP | Flag.OUTSIDE | Flag.DT_LIMIT | Flag.PRECISION
@@ -120,7 +120,7 @@ class Status(eqx.Module):
     @property
     def is_ok(self) -> Array:
         """Whether no error was raised (warnings allowed)."""
-        return (self.flags & jnp.asarray(int(~WARNINGS & 0xFFFF), jnp.uint32)) == jnp.asarray(0, jnp.uint32)
+        return (self.flags & jnp.asarray(int(~WARNINGS) & 0xFFFFFFFF, jnp.uint32)) == jnp.asarray(0, jnp.uint32)
 
     def has(self, flag: Flag) -> Array:
         """Whether `flag` was raised."""

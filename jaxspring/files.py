@@ -1,0 +1,160 @@
+"""Saving and loading systems, states and any tree of arrays.
+
+Every array leaf is stored under its path, such as `forces/0/stiffness`; structure, functions and everything static come from the
+`like` given to `load`, which must agree in names, shapes, types and topology. See `archive` for the format and what it withstands.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .archive import CheckpointError, Path, read_archive, write_archive
+from .state import State
+from .topology.base import Topology
+
+PyTree = Any
+
+
+def save(path: Path, tree: PyTree) -> None:
+    """Save a system, a state, or any tree whose leaves are arrays and numbers, atomically.
+
+    Args:
+        path: the file; `.npz` is the fitting suffix, since `numpy.load` opens it.
+        tree: what to save. Leaves that are no arrays or numbers (functions) are not stored: `load` takes them from `like`.
+
+    Raises:
+        TypeError: a leaf holds something other than real or complex numbers or booleans; half precision that NumPy lacks.
+        ValueError: a name in the tree cannot be stored ('../x').
+        OSError: the disk is full; the file that was there is still there.
+
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     save(folder + "/two.npz", {"stiffness": 3.0})
+    ...     print(load(folder + "/two.npz", like={"stiffness": 0.0}))
+    {'stiffness': 3.0}
+    """
+    write_archive(path, named_arrays(tree), {"kind": "tree", "topologies": topologies(tree)})
+
+
+def load(path: Path, like: PyTree = None) -> PyTree:
+    """Load what `save` wrote.
+
+    Args:
+        path: the file.
+        like: a tree of the same structure, shapes and types, such as a freshly built system; its numbers are replaced.
+            None returns a plain dictionary, name -> NumPy array.
+
+    Raises:
+        CheckpointError: the file is damaged or of another version, or does not fit `like`; both sides are named.
+        OSError: there is no such file.
+    """
+    archive = read_archive(path)
+    if like is None:
+        return archive.arrays
+    expect_same(path, "topology", archive.about.get("topologies"), topologies(like))
+    return restored(path, archive.arrays, like)
+
+
+def save_trajectory(path: Path, states: Any, net: Topology | None = None) -> None:
+    """Save frames as an `.npz` that `numpy.load` opens: `time` (F,) [s], `points` and `velocities` (F, N, D) [m, m/s].
+
+    Args:
+        path: the file.
+        states: a rollout's `Result` with saved states, or a `State` with a leading axis of frames.
+        net: adds `edges` (E, 2), the topology's node pairs.
+
+    Raises:
+        ValueError: nothing was saved in the rollout, or not whole states.
+    """
+    frames = states if isinstance(states, State) else states.saved
+    if not isinstance(frames, State) or np.ndim(frames.time) != 1:
+        raise ValueError(
+            f"There are no frames of whole states to save (got {type(frames).__name__}). Run rollout with save_every and without observe."
+        )
+    arrays = {"time": np.asarray(frames.time), "points": np.asarray(frames.points), "velocities": np.asarray(frames.velocities)}
+    if net is not None:
+        arrays["edges"] = np.asarray(net.edges)
+    write_archive(path, arrays, {"kind": "trajectory"})
+
+
+def leaf_name(path: tuple[Any, ...]) -> str:
+    """The path of a leaf as words joined by '/', such as `forces/0/stiffness`; `value` for a tree that is one leaf."""
+    return jax.tree_util.keystr(path, simple=True, separator="/") or "value"
+
+
+def named_arrays(tree: PyTree) -> dict[str, np.ndarray]:
+    """Every array or number in a tree under its name, on the host."""
+    found: dict[str, np.ndarray] = {}
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+        if not eqx.is_array_like(leaf) or isinstance(leaf, jax.ShapeDtypeStruct):
+            continue
+        name = leaf_name(path)
+        if isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            raise TypeError(f"{name} is a random key; save jax.random.key_data of it and wrap it again after loading.")
+        if name in found:
+            raise ValueError(f"Two leaves are called {name!r}; rename one of the dictionary keys that hold a '/'.")
+        found[name] = np.asarray(leaf)
+    return found
+
+
+def restored(path: Path, arrays: Mapping[str, np.ndarray], like: PyTree) -> PyTree:
+    """`like` with its arrays and numbers replaced by those of the same name.
+
+    Raises:
+        CheckpointError: names, shapes or types differ.
+    """
+    leaves, treedef = jax.tree_util.tree_flatten_with_path(like)
+    wanted = {leaf_name(p) for p, leaf in leaves if _is_stored(leaf)}
+    missing, unknown = sorted(wanted - set(arrays)), sorted(set(arrays) - wanted)
+    if missing or unknown:
+        complain(path, f"it lacks {missing[:5]} and has {unknown[:5]} that `like` does not know; expected {sorted(wanted)[:8]}")
+    return treedef.unflatten([_fitted(path, leaf_name(p), arrays, leaf) for p, leaf in leaves])
+
+
+def topologies(tree: PyTree) -> dict[str, Any]:
+    """Node shape, spring count and a digest of the edges of every topology in a tree, by name."""
+    found = {}
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree, is_leaf=lambda x: isinstance(x, Topology)):
+        if isinstance(leaf, Topology):
+            edges = np.ascontiguousarray(leaf.edges, "<i8")
+            digest = hashlib.sha256(edges.data).hexdigest()[:16] if edges.size else ""
+            found[leaf_name(path)] = {"nodes": list(leaf.node_shape), "springs": leaf.n_springs, "edges": digest}
+    return found
+
+
+def expect_same(path: Path, what: str, found: Any, expected: Any) -> None:
+    """CheckpointError naming both where they differ."""
+    if found != expected:
+        complain(path, f"its {what} is {found}; expected {expected}")
+
+
+def complain(path: Path, problem: str) -> None:
+    """Raise the CheckpointError of this file."""
+    raise CheckpointError(" ".join(f"{os.fspath(path)}: {problem}.".split()))
+
+
+def _is_stored(leaf: Any) -> bool:
+    return eqx.is_array_like(leaf) or isinstance(leaf, jax.ShapeDtypeStruct)
+
+
+def _fitted(path: Path, name: str, arrays: Mapping[str, np.ndarray], leaf: Any) -> Any:
+    """The stored array as `leaf` is: a JAX array, a NumPy array or a number."""
+    if not _is_stored(leaf):
+        return leaf
+    array = arrays[name]
+    shape, dtype = (leaf.shape, np.dtype(leaf.dtype)) if hasattr(leaf, "dtype") else ((), np.asarray(leaf).dtype)
+    if tuple(array.shape) != tuple(shape) or array.dtype != dtype:
+        complain(path, f"{name!r} has shape {array.shape} and dtype {array.dtype}; expected shape {tuple(shape)} and dtype {dtype}")
+    if isinstance(leaf, np.ndarray):
+        return array
+    if isinstance(leaf, jax.Array | jax.ShapeDtypeStruct):
+        return jnp.asarray(array)
+    return array[()] if isinstance(leaf, np.generic) else array.item()

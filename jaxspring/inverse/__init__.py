@@ -1,0 +1,1 @@
+"""Inverse problems: fitting parameters to data by gradients through a simulation."""

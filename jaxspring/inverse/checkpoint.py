@@ -1,0 +1,87 @@
+"""Checkpoints of a fit: everything that the next iteration depends on, so that a resumed fit is bitwise the unbroken one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+
+from ..archive import Path, read_archive, remove_leftovers, write_archive
+from ..files import complain, expect_same, named_arrays, restored, topologies
+
+PyTree = Any
+PARTS = ("parameters", "best", "memory", "carried")
+HISTORY = ("loss", "gradient_norm", "seconds")
+
+
+class Checkpoint(eqx.Module):
+    """Where and how often a fit is saved. One file, replaced as a whole: after a kill the newest complete one is there.
+
+    Attributes:
+        path: the file (static).
+        every: iterations between two writes (static). The end, a stop and Ctrl-C write too.
+    """
+
+    path: Path = eqx.field(static=True)
+    every: int = eqx.field(static=True, default=25)
+
+    def __check_init__(self):
+        if self.every < 1:
+            raise ValueError(f"every = {self.every}; expected 1 or more iterations.")
+
+
+class Snapshot(eqx.Module):
+    """A fit between two iterations.
+
+    Attributes:
+        parameters: unconstrained coordinates of the next iteration.
+        best: unconstrained coordinates of the lowest loss so far.
+        memory: what the optimiser carries.
+        carried: what the loss carries.
+        iteration: iterations done.
+        best_iteration: iteration of the lowest loss; -1 where there is none yet.
+        history: loss, gradient norm and seconds; entries from `iteration` on are not part of the snapshot.
+    """
+
+    parameters: PyTree
+    best: PyTree
+    memory: PyTree
+    carried: PyTree
+    iteration: int
+    best_iteration: int
+    history: dict[str, list[float]]
+
+
+def write_checkpoint(path: Path, snapshot: Snapshot, coordinates: str) -> None:
+    """Write a snapshot atomically. `coordinates` tells the transforms: the numbers mean nothing without them."""
+    arrays = {f"history/{name}": np.asarray(snapshot.history[name][: snapshot.iteration], np.float64) for name in HISTORY}
+    for part in PARTS:
+        arrays |= {f"{part}/{name}": array for name, array in named_arrays(getattr(snapshot, part)).items()}
+    about = {"kind": "fit", "coordinates": coordinates, "best_iteration": snapshot.best_iteration}
+    write_archive(path, arrays, about | {"topologies": topologies(snapshot.parameters)})
+
+
+def read_checkpoint(path: Path, like: Snapshot, coordinates: str) -> Snapshot:
+    """The snapshot in a file, in the shape of `like`.
+
+    Raises:
+        CheckpointError: the file is damaged, or belongs to another fit: other parameters, transforms, optimiser or topology.
+        OSError: there is no such file.
+    """
+    remove_leftovers(path)
+    archive = read_archive(path)
+    expect_same(path, "kind", archive.about.get("kind"), "fit")
+    expect_same(path, "transforms", archive.about.get("coordinates"), coordinates)
+    expect_same(path, "topology", archive.about.get("topologies"), topologies(like.parameters))
+    groups: dict[str, dict[str, np.ndarray]] = {part: {} for part in (*PARTS, "history")}
+    for name, array in archive.arrays.items():
+        part, _, rest = name.partition("/")
+        if part not in groups:
+            complain(path, f"it holds {name!r}; expected only {', '.join(groups)}")
+        groups[part][rest] = array
+    expect_same(path, "history", sorted(groups["history"]), sorted(HISTORY))
+    parts = {part: restored(path, groups[part], getattr(like, part)) for part in PARTS}
+    history = {name: groups["history"][name].tolist() for name in HISTORY}
+    best_iteration = archive.about["best_iteration"]
+    return Snapshot(parts["parameters"], parts["best"], parts["memory"], parts["carried"], len(history["loss"]), best_iteration, history)

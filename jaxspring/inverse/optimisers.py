@@ -1,0 +1,202 @@
+"""Optimisers behind one interface: first-order ones of optax, L-BFGS with a line search, and least squares of optimistix.
+
+An optimiser sees only unconstrained coordinates and an objective. One call of `step` evaluates the objective and says where to go next.
+"""
+
+from __future__ import annotations
+
+import abc
+import contextlib
+from collections.abc import Callable, Iterator
+from functools import cache
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+import optimistix
+from jaxtyping import Array
+
+PyTree = Any
+# (free parameters, carried) -> (value or residuals, (carried, info))
+Objective = Callable[[PyTree, PyTree], tuple[Any, tuple[PyTree, PyTree]]]
+
+
+class Evaluation(eqx.Module):
+    """What one step of an optimiser found.
+
+    Attributes:
+        at: where the objective was evaluated (for least squares: the last accepted point).
+        value: the loss there, a 0-d array.
+        gradient: its gradient there.
+        after: where to go next.
+        memory: what the optimiser carries to the next step.
+        carried: the auxiliary state that the loss handed on.
+        info: what else the loss returned.
+        is_done: whether the optimiser itself sees no further progress.
+    """
+
+    at: PyTree
+    value: Array
+    gradient: PyTree
+    after: PyTree
+    memory: PyTree
+    carried: PyTree
+    info: PyTree
+    is_done: Array
+
+
+class Optimiser(eqx.Module):
+    """How parameters are improved. Abstract; `LBFGS`, `LeastSquares`, or any optax transformation."""
+
+    @abc.abstractmethod
+    def init(self, objective: Objective, free: PyTree, carried: PyTree) -> PyTree:
+        """What the optimiser remembers before the first step."""
+
+    @abc.abstractmethod
+    def step(self, objective: Objective, free: PyTree, memory: PyTree, carried: PyTree) -> Evaluation:
+        """Evaluate the objective at `free`, and choose the next point."""
+
+
+class Optax(Optimiser):
+    """Any gradient transformation of optax, such as `optax.adam(0.05)`; `fit` wraps a bare one in this.
+
+    Attributes:
+        transformation: pass the same object again to avoid a new compilation: optax objects compare by identity.
+    """
+
+    transformation: optax.GradientTransformation = eqx.field(static=True)
+
+    def init(self, objective: Objective, free: PyTree, carried: PyTree) -> PyTree:
+        """The transformation's own state."""
+        with _loose():
+            return self.transformation.init(free)
+
+    def step(self, objective: Objective, free: PyTree, memory: PyTree, carried: PyTree) -> Evaluation:
+        """One gradient, one update."""
+        (value, (carried, info)), gradient = _value_and_grad(objective, free, carried)
+        with _loose():
+            update, memory = self.transformation.update(gradient, memory, free)
+        return Evaluation(free, value, gradient, _moved(free, update), memory, carried, info, jnp.zeros((), bool))
+
+
+class LBFGS(Optimiser):
+    """Limited-memory BFGS with a zoom line search: several evaluations per iteration, few iterations on smooth losses.
+
+    Within one iteration the line search holds `carried` fixed.
+
+    Attributes:
+        memory_size: how many past steps shape the direction (static).
+        max_line_search_steps: evaluations in one line search, at most (static).
+
+    Source: optax.lbfgs.
+    """
+
+    memory_size: int = eqx.field(static=True, default=10)
+    max_line_search_steps: int = eqx.field(static=True, default=20)
+
+    def init(self, objective: Objective, free: PyTree, carried: PyTree) -> PyTree:
+        """The state of optax.lbfgs."""
+        with _loose():
+            return self._transformation().init(free)
+
+    def step(self, objective: Objective, free: PyTree, memory: PyTree, carried: PyTree) -> Evaluation:
+        """One gradient, one line search along the quasi-Newton direction."""
+        (value, (new_carried, info)), gradient = _value_and_grad(objective, free, carried)
+
+        def value_at(point: PyTree) -> Array:
+            return objective(point, carried)[0]
+
+        with _loose():
+            update, new_memory = self._transformation().update(gradient, memory, free, value=value, grad=gradient, value_fn=value_at)
+        return Evaluation(free, value, gradient, _moved(free, update), new_memory, new_carried, info, jnp.zeros((), bool))
+
+    def _transformation(self) -> Any:
+        search = optax.scale_by_zoom_linesearch(max_linesearch_steps=self.max_line_search_steps, initial_guess_strategy="one")
+        return optax.lbfgs(memory_size=self.memory_size, linesearch=search)
+
+
+class LeastSquares(Optimiser):
+    """Levenberg-Marquardt: the loss function returns residuals (an array or a tree of arrays), and half their sum of squares is minimised.
+
+    Attributes:
+        rtol, atol: stop where an accepted step changes parameters and residuals by less (relative and absolute, static).
+        by_reverse_mode: differentiate the residuals in reverse instead of forward mode: cheaper with more parameters than residuals
+            (static).
+
+    Source: optimistix.LevenbergMarquardt.
+    """
+
+    rtol: float = eqx.field(static=True, default=1e-8)
+    atol: float = eqx.field(static=True, default=1e-8)
+    by_reverse_mode: bool = eqx.field(static=True, default=False)
+
+    def init(self, objective: Objective, free: PyTree, carried: PyTree) -> PyTree:
+        """Arrays of the solver's state."""
+        with _loose():
+            return jax.tree.leaves(eqx.filter(self._fresh(objective, free, carried), eqx.is_array))
+
+    def step(self, objective: Objective, free: PyTree, memory: PyTree, carried: PyTree) -> Evaluation:
+        """One evaluation; the point moves only where the sum of squares fell."""
+        # The solver's state holds a traced program, compared by identity: only its arrays leave a step, and a fresh state gives the rest.
+        with _loose():
+            fresh_arrays, program = eqx.partition(self._fresh(objective, free, carried), eqx.is_array)
+            state = eqx.combine(jax.tree.unflatten(jax.tree.structure(fresh_arrays), memory), program)
+            solver, options = self._solver()
+            at, state, _ = solver.step(objective, free, carried, options, state, frozenset())
+        value = 0.5 * jnp.sum(jnp.stack([jnp.sum(r * r) for r in jax.tree.leaves(state.f_info.residual)]))
+        carried, info = state.aux
+        memory = jax.tree.leaves(eqx.filter(state, eqx.is_array))
+        return Evaluation(at, value, state.f_info.compute_grad(), at, memory, carried, info, state.terminate)
+
+    def _solver(self) -> tuple[Any, dict[str, Any]]:
+        return optimistix.LevenbergMarquardt(self.rtol, self.atol), {"jac": "bwd" if self.by_reverse_mode else "fwd"}
+
+    def _fresh(self, objective: Objective, free: PyTree, carried: PyTree) -> Any:
+        solver, options = self._solver()
+        residual, aux = jax.eval_shape(objective, free, carried)
+        return solver.init(objective, free, carried, options, residual, aux, frozenset())
+
+
+def as_optimiser(optimiser: Any) -> Optimiser:
+    """An `Optimiser`: Adam with a learning rate of 0.05 for None, and optax transformations wrapped."""
+    if optimiser is None:
+        return _adam()
+    if isinstance(optimiser, Optimiser):
+        return optimiser
+    if isinstance(optimiser, optax.GradientTransformation):
+        return Optax(optimiser)
+    raise TypeError(
+        f"optimiser is a {type(optimiser).__name__}; expected an optax transformation such as optax.adam(0.05), LBFGS() or LeastSquares()."
+    )
+
+
+@cache
+def _adam() -> Optax:
+    """The default; one object, so that fits share a compilation."""
+    return Optax(optax.adam(0.05))
+
+
+@contextlib.contextmanager
+def _loose() -> Iterator[None]:
+    """JAX's ordinary promotion rules: optax and optimistix mix integer counts with floats. Parameters keep their types all the same."""
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        yield
+
+
+def _value_and_grad(objective: Objective, free: PyTree, carried: PyTree) -> Any:
+    def scalar(point: PyTree) -> Any:
+        value, rest = objective(point, carried)
+        if jnp.shape(value) != () or not jnp.issubdtype(jnp.result_type(value), jnp.floating):
+            raise TypeError(
+                f"loss returned {jax.tree.map(jnp.shape, value)} of {jnp.result_type(value)}; expected one real number. "
+                "For an array of residuals pass optimiser=LeastSquares(); for more results use `carried`."
+            )
+        return value, rest
+
+    return jax.value_and_grad(scalar, has_aux=True)(free)
+
+
+def _moved(free: PyTree, update: PyTree) -> PyTree:
+    return jax.tree.map(lambda p, u: p + u.astype(p.dtype), free, update)

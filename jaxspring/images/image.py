@@ -96,7 +96,8 @@ class Image(eqx.Module):
 
 def _per_axis(name: str, value: PerAxis, dtype: jnp.dtype, must_be_positive: bool = False) -> tuple[Array, Array]:
     """A number, or a pair (x, y), as two scalar arrays of the pixels' type."""
-    pair: tuple[Any, ...] = tuple(value) if isinstance(value, (tuple, list)) or np.ndim(value) == 1 else (value, value)
+    given: Any = value
+    pair: tuple[Any, ...] = tuple(given) if isinstance(given, (tuple, list)) or np.ndim(given) == 1 else (given, given)
     if len(pair) != 2 or any(np.ndim(part) for part in pair):
         raise ValueError(f"{name} must be one number or a pair (along x, along y), got {value!r}.")
     for axis, part in zip("xy", pair, strict=True):

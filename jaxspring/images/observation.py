@@ -14,9 +14,11 @@ Source: slides "Adaptive Meshes"; the normalisation is ours (raw grey levels wou
 from __future__ import annotations
 
 import abc
+import functools
 from collections.abc import Callable, Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array
@@ -24,17 +26,23 @@ from jaxtyping import Array
 from .image import Image
 from .smoothing import Length, smooth
 
+# One program instead of a dozen where a function is called outside `jit`; inside, it leaves no trace.
+_one_program = functools.partial(jax.jit, inline=True)
 
+
+@_one_program
 def image_gradient(image: Image) -> tuple[Array, Array]:
     """Slopes (d/dx, d/dy), each `(ny, nx)` [image unit per m]: central differences, one-sided on the border; zero along one lone pixel."""
     return _slope(image.values, 1) / image.spacing[0], _slope(image.values, 0) / image.spacing[1]
 
 
+@_one_program
 def gradient_magnitude(image: Image) -> Array:
     """|grad d| at the pixels, `(ny, nx)` [image unit per m]. Where the gradient is zero its derivative is taken as zero, not NaN."""
     return _norm(*image_gradient(image))
 
 
+@_one_program
 def principal_curvatures(image: Image) -> tuple[Array, Array]:
     """Larger and smaller principal curvature of the surface z = image, each `(ny, nx)` [1/m], with pixels in the unit of the spacing.
 

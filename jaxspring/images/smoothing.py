@@ -7,8 +7,10 @@ SciPy's default, which keeps the mean of the image exactly.
 
 from __future__ import annotations
 
+import functools
 import math
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -76,6 +78,7 @@ def smoothing_radius(sigma: Length, spacing: Length | tuple[Length, Length] = 1.
     return math.ceil(deviations * sigma / finest * (1 - 1e-6))
 
 
+@functools.partial(jax.jit, static_argnames="radius", inline=True)
 def _gaussian_band(deviation: Array, radius: int) -> Array:
     """Band matrix of the Gaussian whose standard deviation is given in pixels; the kernel sums to one."""
     square = jnp.square(deviation)

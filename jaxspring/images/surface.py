@@ -6,15 +6,20 @@ reverse pass holds a scatter only where the pixels themselves are differentiated
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from .sampling import Sampling
+
+# One program instead of a dozen where a method is called outside `jit`; inside, it leaves no trace.
+_one_program = functools.partial(jax.jit, inline=True)
 
 
 class Surface(eqx.Module):
@@ -30,6 +35,7 @@ class Surface(eqx.Module):
     shape: tuple[int, int] = eqx.field(static=True)
     method: Sampling
 
+    @_one_program
     def value(self, x: ArrayLike, y: ArrayLike) -> Array:
         """Values at the points `(x, y)`, two arrays of any one shape [m] (or one of them a number)."""
         (column, row), finite = self._locate(x, y)
@@ -37,6 +43,7 @@ class Surface(eqx.Module):
         value = _weighted(self.method.weights(row.fraction), [_weighted(self.method.weights(column.fraction), line) for line in block])
         return jnp.where(finite, value, jnp.nan)
 
+    @_one_program
     def value_and_gradient(self, x: ArrayLike, y: ArrayLike) -> tuple[Array, Array, Array]:
         """Value, d value/dx and d value/dy at the points `(x, y)`, for the price of one gather [image unit, and that per m].
 

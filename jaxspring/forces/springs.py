@@ -8,6 +8,7 @@ Source: slide "Force Computation" (length |r|, deformation e = |r| - l).
 from __future__ import annotations
 
 import abc
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -111,7 +112,7 @@ class Springs(Force):
         one = jnp.ones((), state.dtype)
         if self.law.energy(one, one, one) is None:
             return None
-        return self.net.map_springs(lambda *spring: spring_energy(self.law, *spring), *self._along(state)).sum()
+        return self.net.sum(self.net.map_springs(lambda *spring: spring_energy(self.law, *spring), *self._along(state)))
 
     def tension(self, state: State) -> EdgeField:
         """Pull of each spring along itself [N]: positive stretched, negative squeezed. `net.flatten` gives (E,)."""
@@ -142,9 +143,9 @@ class Springs(Force):
 
         def degenerate(d: Vector, l: Array) -> Array:
             squared = d.dot(d)
-            return (squared <= tiny(squared.dtype)) & (l > 0)
+            return ((squared <= tiny(squared.dtype)) & (l > 0)).astype(jnp.int32)
 
-        count = self.net.map_springs(degenerate, d, l).sum().astype(jnp.int32)
+        count = self.net.sum(self.net.map_springs(degenerate, d, l))
         return (Finding(Flag.COINCIDENT, count, jnp.asarray(-1, jnp.int32)),)
 
     def invalid(self) -> Array | None:
@@ -165,14 +166,14 @@ class Springs(Force):
         def shortest(d: Vector, l: Array) -> Array:
             length = d.norm()
             never = jnp.full_like(length, jnp.inf)
-            return jnp.min(jnp.where(l > 0, jnp.minimum(jnp.where(length > 0, length, never), l), never))
+            return jnp.where(l > 0, jnp.minimum(jnp.where(length > 0, length, never), l), never)
 
         def longest_without_rest(d: Vector, l: Array) -> Array:
             length = d.norm()
-            return jnp.max(jnp.where(l > 0, jnp.zeros_like(length), length))
+            return jnp.where(l > 0, jnp.zeros_like(length), length)
 
-        finest = jnp.min(jnp.stack(self.net.map_springs(shortest, d, l).families))
-        longest = jnp.max(jnp.stack(self.net.map_springs(longest_without_rest, d, l).families))
+        finest = _extreme(jnp.min, self.net.inside(self.net.map_springs(shortest, d, l), jnp.inf))
+        longest = _extreme(jnp.max, self.net.inside(self.net.map_springs(longest_without_rest, d, l), 0.0))
         length = jnp.where(longest > 0, jnp.minimum(finest, longest), finest)
         largest = jnp.max(jnp.stack([jnp.max(jnp.abs(a)) for a in self._seen(state)]))
         return largest * jnp.asarray(jnp.finfo(state.dtype).eps, state.dtype) / length
@@ -216,6 +217,10 @@ def _edge_constant(net: Topology, name: str, value: Any) -> Any:
     value = as_inexact(name, value)
     has_shape(name, value, {"one number": (), "one per spring": (net.n_springs,)})
     return value
+
+
+def _extreme(reduce: Callable[[Array], Array], field: EdgeField) -> Array:
+    return reduce(jnp.stack([reduce(entry) for entry in field.families]))
 
 
 def _check_sign(name: str, value: Any, why: str, any_sign: bool = False) -> None:

@@ -100,9 +100,22 @@ class Topology(eqx.Module):
         return int(np.prod(self.node_shape))
 
     @property
+    @abc.abstractmethod
+    def family_sizes(self) -> tuple[int, ...]:
+        """Number of springs in each entry of an edge field."""
+
+    @property
     def n_springs(self) -> int:
         """Number of springs E."""
-        return sum(int(np.prod(shape)) for shape in self.family_shapes)
+        return sum(self.family_sizes)
+
+    @abc.abstractmethod
+    def inside(self, field: EdgeField, fill: float) -> EdgeField:
+        """The field with `fill` at the places that hold no spring (a lattice keeps such margins); take it before a sum or a minimum."""
+
+    def sum(self, field: EdgeField) -> Array:
+        """Sum of a field over all springs."""
+        return sum((jnp.sum(entry, dtype=field.dtype) for entry in self.inside(field, 0).families), start=jnp.zeros((), field.dtype))
 
     def map_springs(self, law: Callable[..., Any], *fields: Any) -> EdgeField:
         """Call `law` once per spring family; a number or 0-d array is passed to every family as it is."""

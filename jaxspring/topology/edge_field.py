@@ -31,9 +31,10 @@ class EdgeField(eqx.Module):
         """Apply `function` to each family (and those of `others`)."""
         return EdgeField(tuple(function(*entries) for entries in zip(self.families, *(o.families for o in others), strict=True)))
 
-    def sum(self) -> Any:
-        """Sum over all springs."""
-        return sum((jnp.sum(entry) for entry in self.families[1:]), start=jnp.sum(self.families[0]))
+    @property
+    def dtype(self) -> jnp.dtype:
+        """Type of the entries."""
+        return jnp.result_type(jax.tree.leaves(self.families)[0])
 
     def __iter__(self) -> Iterator[Any]:
         return iter(self.families)

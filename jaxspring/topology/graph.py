@@ -94,6 +94,15 @@ class Graph(Topology):
         return (self.tails.shape,)
 
     @property
+    def family_sizes(self) -> tuple[int, ...]:
+        """(E,)"""
+        return self.tails.shape
+
+    def inside(self, field: EdgeField, fill: float) -> EdgeField:
+        """The field itself: a graph keeps no margins."""
+        return field
+
+    @property
     def node_permutation(self) -> Permutation:
         """From the user's node order to the internal one."""
         return self.nodes

@@ -1,17 +1,16 @@
 """Regular lattices in one, two and three dimensions.
 
 A node field is an array of shape (n,), (ny, nx) or (nz, ny, nx). A spring family is one offset: its springs join every node `i`
-to node `i + offset`. Differences are shifted slices, and pulls are padded back, so no index is ever read:
-
-    d = x[o:] - x[:-o]        f = pad(p, after) - pad(p, before)
-
-On a periodic axis the slice is a roll, and `box` (the period in each coordinate, [m]) takes the minimum image.
+to node `i + offset`. Differences and sums on the nodes are shifted slices (see `shifts`), so no index is ever read. On a periodic
+axis the slice is a roll, and `box` (the period in each coordinate, [m]) takes the minimum image.
 """
 
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -21,7 +20,9 @@ from jax import lax
 from jaxtyping import Array
 
 from .._checks import as_inexact
+from ..numerics import linear_call
 from ..vector import Vector
+from . import shifts
 from .base import Topology
 from .edge_field import EdgeField
 
@@ -92,12 +93,19 @@ class Lattice(Topology):
         return None
 
     @property
+    def grid_shape(self) -> shifts.Grid:
+        """What the functions of `shifts` need to know."""
+        return shifts.Grid(self.shape, self.offsets, self.periodic)
+
+    @property
     def family_shapes(self) -> tuple[tuple[int, ...], ...]:
-        """Shape of each family's tails."""
-        return tuple(
-            tuple(n if wraps else max(n - abs(o), 0) for n, o, wraps in zip(self.shape, offset, self.periodic, strict=True))
-            for offset in self.offsets
-        )
+        """Shape in which each family's values are kept; it has margins of springs that do not exist (see `shifts`)."""
+        return tuple(self.grid_shape.extended(offset) for offset in self.offsets)
+
+    @property
+    def family_sizes(self) -> tuple[int, ...]:
+        """Number of springs in each family."""
+        return tuple(math.prod(self.grid_shape.actual(offset)) for offset in self.offsets)
 
     @property
     def edges(self) -> np.ndarray:
@@ -105,54 +113,57 @@ class Lattice(Topology):
         numbers = np.arange(self.n_nodes).reshape(self.shape)
         pairs = []
         for offset in self.offsets:
-            tail, head = _ends(numbers, offset, self.periodic, np.roll)
-            pairs.append(np.stack([tail.ravel(), head.ravel()], axis=-1))
+            steps = [0 if wraps else o for o, wraps in zip(offset, self.periodic, strict=True)]
+            tails = tuple(slice(max(-o, 0), n - max(o, 0)) for o, n in zip(steps, self.shape, strict=True))
+            heads = np.roll(numbers, [-o for o in offset], range(len(offset)))
+            pairs.append(np.stack([numbers[tails].ravel(), heads[tails].ravel()], axis=-1))
         return np.concatenate(pairs).astype(np.int32) if pairs else np.zeros((0, 2), np.int32)
 
     def difference(self, x: Vector) -> EdgeField:
         """Head minus tail along each spring, by shifted slices."""
-        families = []
-        for offset in self.offsets:
-            ends = [_ends(a, offset, self.periodic, jnp.roll) for a in x]
-            d = Vector(tuple(head - tail for tail, head in ends))
-            families.append(d if self.box is None else minimum_image(d, self.box))
-        return EdgeField(tuple(families))
+        forward = partial(_difference, self.grid_shape)
+        backward = partial(_minus_accumulate, self.grid_shape)
+        columns = [linear_call(forward, backward, (), a) for a in x]
+        families = tuple(Vector(parts) for parts in zip(*columns, strict=True))
+        return EdgeField(families if self.box is None else tuple(minimum_image(d, self.box) for d in families))
 
     def accumulate(self, pulls: EdgeField) -> Vector:
-        """Force on each node: each pull on its tail, the opposite on its head, by padding."""
-        dim = len(pulls.families[0])
-        totals: list[Any] = [None] * dim
-        for offset, pull in zip(self.offsets, pulls.families, strict=True):
-            for i, p in enumerate(pull):
-                tail, head = _spread(p, offset, self.periodic)
-                totals[i] = tail - head if totals[i] is None else totals[i] + (tail - head)
-        return Vector(tuple(totals))
+        """Force on each node: each pull on its tail, the opposite on its head, by shifted slices."""
+        forward = partial(_minus_accumulate, self.grid_shape)
+        backward = partial(_difference, self.grid_shape)
+        columns = zip(*(pull.components for pull in pulls.families), strict=True)
+        return -Vector(tuple(linear_call(forward, backward, (), tuple(column)) for column in columns))
 
     def incident_sum(self, values: EdgeField) -> Array:
         """Sum over the springs at each node."""
-        total = None
-        for offset, value in zip(self.offsets, values.families, strict=True):
-            tail, head = _spread(value, offset, self.periodic)
-            total = tail + head if total is None else total + (tail + head)
-        return jnp.zeros(self.shape) if total is None else total
+        if not self.offsets:
+            return jnp.zeros(self.shape)
+        return linear_call(partial(_sum_at_nodes, self.grid_shape), partial(_sum_of_ends, self.grid_shape), (), values.families)
 
     def average(self, a: Array) -> EdgeField:
         """Mean of a node array over the two ends of each spring."""
-        ends = (_ends(a, offset, self.periodic, jnp.roll) for offset in self.offsets)
-        return EdgeField(tuple(0.5 * (tail + head) for tail, head in ends))
+        ends = linear_call(partial(_sum_of_ends, self.grid_shape), partial(_sum_at_nodes, self.grid_shape), (), a)
+        return EdgeField(tuple(0.5 * both for both in ends))
 
     def split(self, flat: Array) -> EdgeField:
-        """(E,) array -> edge field, by static slices."""
+        """(E,) array -> edge field, by static slices. Springs that do not exist get the value 1: no length divides by zero."""
         families, start = [], 0
-        for shape in self.family_shapes:
-            size = int(np.prod(shape))
-            families.append(lax.slice(flat, (start,), (start + size,)).reshape(shape))
+        for offset, size in zip(self.offsets, self.family_sizes, strict=True):
+            actual = lax.slice(flat, (start,), (start + size,)).reshape(self.grid_shape.actual(offset))
+            families.append(shifts.extend(self.grid_shape, actual, offset, 1.0))
             start += size
         return EdgeField(tuple(families))
 
     def flatten(self, field: EdgeField) -> Array:
         """Edge field -> (E,) array."""
-        return jnp.concatenate([jnp.ravel(entry) for entry in field.families]) if field.families else jnp.zeros((0,))
+        entries = zip(field.families, self.offsets, strict=True)
+        flat = [jnp.ravel(shifts.crop(self.grid_shape, entry, offset)) for entry, offset in entries]
+        return jnp.concatenate(flat) if flat else jnp.zeros((0,))
+
+    def inside(self, field: EdgeField, fill: float) -> EdgeField:
+        """The field with `fill` where a family's margin holds no spring."""
+        entries = zip(field.families, self.offsets, strict=True)
+        return EdgeField(tuple(shifts.inside(self.grid_shape, entry, offset, fill) for entry, offset in entries))
 
     def grid(self, spacing: float | Sequence[float] = 1.0) -> np.ndarray:
         """(N, D) rest positions [m] of a grid with `spacing` along x (last axis), y, z."""
@@ -227,32 +238,20 @@ def _check_wrap(shape: tuple[int, ...], wraps: tuple[bool, ...], offsets: tuple[
             raise ValueError(f"axis {axis} wraps with {n} nodes, but springs reach {reach} along it; needs at least {2 * reach + 1}.")
 
 
-def _ends(a: Any, offset: Offset, periodic: tuple[bool, ...], roll: Any) -> tuple[Any, Any]:
-    """Values at the tails and heads of a family."""
-    tails, heads = [], []
-    for n, o, wraps in zip(a.shape, offset, periodic, strict=True):
-        lo, hi = (0, 0) if wraps else (max(-o, 0), max(o, 0))
-        tails.append(slice(lo, max(n - hi, lo)))
-        heads.append(slice(hi, max(n - lo, hi)))
-    shifts = [(axis, -o) for axis, (o, wraps) in enumerate(zip(offset, periodic, strict=True)) if wraps and o]
-    rolled = roll(a, [s for _, s in shifts], [axis for axis, _ in shifts]) if shifts else a
-    return a[tuple(tails)], rolled[tuple(heads)]
+def _difference(grid: shifts.Grid, _: Any, x: Array) -> tuple[Array, ...]:
+    return shifts.difference(grid, x)
 
 
-def _spread(p: Array, offset: Offset, periodic: tuple[bool, ...]) -> tuple[Array, Array]:
-    """A family's values placed at its tails and at its heads, in node shape."""
-    zero = np.zeros((), p.dtype)
-    at_tail, at_head = [], []
-    for o, wraps in zip(offset, periodic, strict=True):
-        lo, hi = (0, 0) if wraps else (max(-o, 0), max(o, 0))
-        at_tail.append((lo, hi, 0))
-        at_head.append((hi, lo, 0))
-    tail = lax.pad(p, zero, at_tail)
-    head = lax.pad(p, zero, at_head)
-    shifts = [(axis, o) for axis, (o, wraps) in enumerate(zip(offset, periodic, strict=True)) if wraps and o]
-    if shifts:
-        head = jnp.roll(head, [s for _, s in shifts], [axis for axis, _ in shifts])
-    return tail, head
+def _minus_accumulate(grid: shifts.Grid, _: Any, pulls: tuple[Array, ...]) -> Array:
+    return -shifts.accumulate(grid, pulls)
+
+
+def _sum_of_ends(grid: shifts.Grid, _: Any, a: Array) -> tuple[Array, ...]:
+    return shifts.sum_of_ends(grid, a)
+
+
+def _sum_at_nodes(grid: shifts.Grid, _: Any, values: tuple[Array, ...]) -> Array:
+    return shifts.sum_at_nodes(grid, values)
 
 
 __all__ = ["BEND", "BODY", "SHEAR", "STRUCTURAL", "Lattice", "SpringFamilies", "lattice", "minimum_image"]

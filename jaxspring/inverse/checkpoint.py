@@ -11,7 +11,7 @@ from ..archive import Path, read_archive, remove_leftovers, write_archive
 from ..files import complain, expect_same, named_arrays, restored, topologies
 
 PyTree = Any
-PARTS = ("parameters", "best", "memory", "carried")
+PARTS = ("parameters", "best", "memory", "carried", "best_carried")
 HISTORY = ("loss", "gradient_norm", "seconds")
 
 
@@ -21,10 +21,12 @@ class Checkpoint(eqx.Module):
     Attributes:
         path: the file (static).
         every: iterations between two writes (static). The end, a stop and Ctrl-C write too.
+        note: names the problem, such as a digest of its data; a checkpoint with another note is refused (static).
     """
 
     path: Path = eqx.field(static=True)
     every: int = eqx.field(static=True, default=25)
+    note: str = eqx.field(static=True, default="")
 
     def __check_init__(self):
         if self.every < 1:
@@ -39,6 +41,7 @@ class Snapshot(eqx.Module):
         best: unconstrained coordinates of the lowest loss so far.
         memory: what the optimiser carries.
         carried: what the loss carries.
+        best_carried: what it handed on where the loss was lowest.
         iteration: iterations done.
         best_iteration: iteration of the lowest loss; -1 where there is none yet.
         history: loss, gradient norm and seconds; entries from `iteration` on are not part of the snapshot.
@@ -48,30 +51,33 @@ class Snapshot(eqx.Module):
     best: PyTree
     memory: PyTree
     carried: PyTree
+    best_carried: PyTree
     iteration: int
     best_iteration: int
     history: dict[str, list[float]]
 
 
-def write_checkpoint(path: Path, snapshot: Snapshot, coordinates: str) -> None:
+def write_checkpoint(place: Checkpoint, snapshot: Snapshot, coordinates: str) -> None:
     """Write a snapshot atomically. `coordinates` tells the transforms: the numbers mean nothing without them."""
     arrays = {f"history/{name}": np.asarray(snapshot.history[name][: snapshot.iteration], np.float64) for name in HISTORY}
     for part in PARTS:
         arrays |= {f"{part}/{name}": array for name, array in named_arrays(getattr(snapshot, part)).items()}
-    about = {"kind": "fit", "coordinates": coordinates, "best_iteration": snapshot.best_iteration}
-    write_archive(path, arrays, about | {"topologies": topologies(snapshot.parameters)})
+    about = {"kind": "fit", "note": place.note, "coordinates": coordinates, "best_iteration": snapshot.best_iteration}
+    write_archive(place.path, arrays, about | {"topologies": topologies(snapshot.parameters)})
 
 
-def read_checkpoint(path: Path, like: Snapshot, coordinates: str) -> Snapshot:
+def read_checkpoint(place: Checkpoint, like: Snapshot, coordinates: str) -> Snapshot:
     """The snapshot in a file, in the shape of `like`.
 
     Raises:
-        CheckpointError: the file is damaged, or belongs to another fit: other parameters, transforms, optimiser or topology.
+        CheckpointError: the file is damaged, or belongs to another fit: another note, other parameters, transforms, optimiser or topology.
         OSError: there is no such file.
     """
+    path = place.path
     remove_leftovers(path)
     archive = read_archive(path)
     expect_same(path, "kind", archive.about.get("kind"), "fit")
+    expect_same(path, "problem", archive.about.get("note"), place.note)
     expect_same(path, "transforms", archive.about.get("coordinates"), coordinates)
     expect_same(path, "topology", archive.about.get("topologies"), topologies(like.parameters))
     groups: dict[str, dict[str, np.ndarray]] = {part: {} for part in (*PARTS, "history")}
@@ -84,4 +90,5 @@ def read_checkpoint(path: Path, like: Snapshot, coordinates: str) -> Snapshot:
     parts = {part: restored(path, groups[part], getattr(like, part)) for part in PARTS}
     history = {name: groups["history"][name].tolist() for name in HISTORY}
     best_iteration = archive.about["best_iteration"]
-    return Snapshot(parts["parameters"], parts["best"], parts["memory"], parts["carried"], len(history["loss"]), best_iteration, history)
+    values = [parts[part] for part in PARTS]
+    return Snapshot(*values, iteration=len(history["loss"]), best_iteration=best_iteration, history=history)

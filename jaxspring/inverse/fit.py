@@ -52,6 +52,7 @@ class Fit:
         history: loss, gradient norm and seconds of every iteration.
         carried: what the loss handed on last (None without).
         info: what else the loss returned last (None without).
+        best_carried: what the loss handed on at its lowest (None without).
         status: NONFINITE, INVALID or INTERRUPTED, with the iteration as its step; see `raise_for_status`.
         reason: why it ended.
     """
@@ -63,6 +64,7 @@ class Fit:
     history: History
     carried: PyTree
     info: PyTree
+    best_carried: PyTree
     status: Status
     reason: StopReason
 
@@ -151,10 +153,10 @@ def fit(
     refuse_invalid(objective.parameters(free))
     carried = jax.tree.map(_as_array, carried)
     empty = {"loss": [], "gradient_norm": [], "seconds": []}
-    start = Snapshot(free, free, first_memory(objective, optimiser, free, carried), carried, 0, -1, empty)
+    start = Snapshot(free, free, first_memory(objective, optimiser, free, carried), carried, carried, 0, -1, empty)
     coordinates = "; ".join(map(str, chosen))
     if resume and checkpoint is not None:
-        start = read_checkpoint(checkpoint.path, start, coordinates)
+        start = read_checkpoint(checkpoint, start, coordinates)
     run = _Run(objective, optimiser, start, coordinates, checkpoint)
     reason = run.to_end(n_iterations, stop or Stop(), on_iteration, progress, clock)
     return run.result(reason)
@@ -168,7 +170,7 @@ class _Run:
         self.now = start  # what a resumed fit would start from
         self.history = start.history
         self.best, self.best_iteration, self.last = start.best, start.best_iteration, start.parameters
-        self.status, self.info, self.carried = Status.ok(), None, start.carried
+        self.status, self.info, self.carried, self.best_carried = Status.ok(), None, start.carried, start.best_carried
 
     def to_end(self, n_iterations: int, stop: Stop, on_iteration: Any, progress: Progress | None, clock: Stopwatch) -> StopReason:
         """Iterate until something says stop; what was done is kept whatever happens."""
@@ -197,9 +199,10 @@ class _Run:
         value = self.history["loss"][self.best_iteration] if self.best_iteration >= 0 else float("nan")
         back = self.objective.parameters
         history = History(*(np.asarray(self.history[name]) for name in ("loss", "gradient_norm", "seconds")))
-        carried = self.carried if self.objective.has_carried else None
-        info = self.info if self.objective.has_carried else None
-        return Fit(back(self.best), back(self.last), value, self.best_iteration, history, carried, info, self.status, reason)
+        last, best = (self.carried, self.info), self.best_carried
+        if not self.objective.has_carried:
+            last, best = (None, None), None
+        return Fit(back(self.best), back(self.last), value, self.best_iteration, history, *last, best, self.status, reason)
 
     def _advance(self) -> Report:
         watch = Stopwatch()
@@ -225,7 +228,7 @@ class _Run:
         usable = not (checks.is_nonfinite or checks.is_invalid)
         is_best = usable and (self.best_iteration < 0 or loss < losses[self.best_iteration])
         if is_best:
-            self.best, self.best_iteration = report.at, index
+            self.best, self.best_iteration, self.best_carried = report.at, index, report.carried
         asked = None
         if on_iteration is not None:
             norm = float(checks.gradient_norm)
@@ -244,12 +247,14 @@ class _Run:
 
     def _next(self, report: Report) -> Snapshot:
         done = len(self.history["loss"])
-        return Snapshot(report.after, self.best, report.memory, report.carried, done, self.best_iteration, self.history)
+        return Snapshot(
+            report.after, self.best, report.memory, report.carried, self.best_carried, done, self.best_iteration, self.history
+        )
 
     def _save(self) -> None:
         """Write what the next iteration starts from; an evaluation that was not followed by an update is done again on resuming."""
         if self.checkpoint is not None:
-            write_checkpoint(self.checkpoint.path, self.now, self.coordinates)
+            write_checkpoint(self.checkpoint, self.now, self.coordinates)
 
 
 def _as_array(leaf: Any) -> Any:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import abc
 import contextlib
 from collections.abc import Callable, Iterator
-from functools import cache
 from typing import Any
 
 import equinox as eqx
@@ -48,7 +47,7 @@ class Evaluation(eqx.Module):
 
 
 class Optimiser(eqx.Module):
-    """How parameters are improved. Abstract; `LBFGS`, `LeastSquares`, or any optax transformation."""
+    """How parameters are improved. Abstract; `Adam`, `LBFGS`, `LeastSquares`, or any optax transformation."""
 
     @abc.abstractmethod
     def init(self, objective: Objective, free: PyTree, carried: PyTree) -> PyTree:
@@ -79,6 +78,38 @@ class Optax(Optimiser):
         with _loose():
             update, memory = self.transformation.update(gradient, memory, free)
         return Evaluation(free, value, gradient, _moved(free, update), memory, carried, info, jnp.zeros((), bool))
+
+
+class Adam(Optimiser):
+    """Adam, with a learning rate that may fall along a cosine. Two of equal settings share a compilation.
+
+    Attributes:
+        learning_rate: of the first iteration, in unconstrained coordinates (static).
+        b1: decay of the mean gradient per iteration (static).
+        decay_over: iterations over which the rate falls; None keeps it (static).
+        last_fraction: what is left of the rate then (static).
+
+    Source: optax.adam, optax.cosine_decay_schedule.
+    """
+
+    learning_rate: float = eqx.field(static=True, default=0.05)
+    b1: float = eqx.field(static=True, default=0.9)
+    decay_over: int | None = eqx.field(static=True, default=None)
+    last_fraction: float = eqx.field(static=True, default=0.05)
+
+    def init(self, objective: Objective, free: PyTree, carried: PyTree) -> PyTree:
+        """Mean gradient, mean square, count."""
+        return self._optax().init(objective, free, carried)
+
+    def step(self, objective: Objective, free: PyTree, memory: PyTree, carried: PyTree) -> Evaluation:
+        """One gradient, one update."""
+        return self._optax().step(objective, free, memory, carried)
+
+    def _optax(self) -> Optax:
+        rate: Any = self.learning_rate
+        if self.decay_over:
+            rate = optax.cosine_decay_schedule(self.learning_rate, self.decay_over, self.last_fraction)
+        return Optax(optax.adam(rate, b1=self.b1))
 
 
 class LBFGS(Optimiser):
@@ -162,20 +193,14 @@ class LeastSquares(Optimiser):
 def as_optimiser(optimiser: Any) -> Optimiser:
     """An `Optimiser`: Adam with a learning rate of 0.05 for None, and optax transformations wrapped."""
     if optimiser is None:
-        return _adam()
+        return Adam()
     if isinstance(optimiser, Optimiser):
         return optimiser
     if isinstance(optimiser, optax.GradientTransformation):
         return Optax(optimiser)
     raise TypeError(
-        f"optimiser is a {type(optimiser).__name__}; expected an optax transformation such as optax.adam(0.05), LBFGS() or LeastSquares()."
+        f"optimiser is a {type(optimiser).__name__}; expected an optax transformation such as optax.sgd(0.1), Adam(), LBFGS() or LeastSquares()."
     )
-
-
-@cache
-def _adam() -> Optax:
-    """The default; one object, so that fits share a compilation."""
-    return Optax(optax.adam(0.05))
 
 
 @contextlib.contextmanager

@@ -90,6 +90,7 @@ def test_e4_coordinates_that_are_no_place(rng, dtype, method):
         np.testing.assert_array_equal(np.isnan(values), [True, True, True, False, False])
     for values in image.sample_with_gradient(jnp.full_like(x, 2.0), x, method):
         np.testing.assert_array_equal(np.isnan(values), [True, True, True, False, False])
+    np.testing.assert_array_equal(np.isnan(image.sample(x, 2.0, method)), [True, True, True, False, False])
     assert image.sample(x, x, method)[3] == pytest.approx(float(image.values[-1, -1]), abs=1e-5)
     assert image.outside(x, x).all()
 

@@ -139,7 +139,7 @@ def test_i3_npy_headers_that_claim_too_much(tmp_path, shape):
 
 
 def test_i3_archive_that_unpacks_to_much(tmp_path):
-    """A member of 256 MB packed into 250 kB is refused by its header, unread; one that lies about its length is cut short."""
+    """A member of 256 MB packed into 250 kB is refused by its header, unread."""
     path = tmp_path / "a.npz"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("pixels.npy", "w") as member:
         member.write(npy_header((16_000, 16_000), "|u1"))
@@ -151,8 +151,18 @@ def test_i3_archive_that_unpacks_to_much(tmp_path):
         assert tracemalloc.get_traced_memory()[1] < 8e6
     finally:
         tracemalloc.stop()
-    (tmp_path / "b.npy").write_bytes(npy_header((1000, 1000)) + bytes(80))
-    assert "cut short" in refusal(tmp_path / "b.npy")
+
+
+def test_i3_npy_that_is_shorter_than_it_claims(tmp_path):
+    """A header within the limit, with 80 bytes after it where 400 MB should be: refused without taking 400 MB."""
+    path = tmp_path / "a.npy"
+    path.write_bytes(npy_header((7000, 7000)) + bytes(80))
+    tracemalloc.start()
+    try:
+        assert "cut short" in refusal(path)
+        assert tracemalloc.get_traced_memory()[1] < 8e6
+    finally:
+        tracemalloc.stop()
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ import math
 import os
 import pathlib
 import secrets
+import shutil
 import zipfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -105,6 +106,27 @@ def atomic_file(path: Path) -> Iterator[IO[bytes]]:
     except BaseException:
         beside.unlink(missing_ok=True)
         raise
+    _sync_folder(target.parent)
+
+
+@contextlib.contextmanager
+def atomic_folder(path: Path) -> Iterator[pathlib.Path]:
+    """A new folder, filled beside `path` and put in its place at the end, whole; what was there before goes only then."""
+    target = pathlib.Path(path).absolute()
+    beside = target.parent / f".{target.name}.{secrets.token_hex(4)}.tmp"
+    old = beside.with_suffix(".old")
+    beside.mkdir()
+    try:
+        yield beside
+        if target.exists():
+            os.replace(target, old)
+        os.replace(beside, target)
+    except BaseException:
+        if old.exists() and not target.exists():
+            os.replace(old, target)
+        shutil.rmtree(beside, ignore_errors=True)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
     _sync_folder(target.parent)
 
 

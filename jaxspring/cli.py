@@ -77,7 +77,8 @@ def run(arguments: Arguments) -> int:
     from .scenes.job import Job
 
     try:
-        job = Job(_load(arguments), arguments.nodes, arguments.parameters, arguments.iterations, arguments.out)
+        name = "elevation model of matplotlib" if arguments.image is None else str(arguments.image)
+        job = Job(_load(arguments), name, arguments.nodes, arguments.parameters, arguments.iterations, arguments.out)
         outcome = job.run(arguments.resume)
     except (ImageError, CheckpointError, OSError, ImportError, MemoryError) as error:
         return complain(str(error) or "there is not enough memory.", UNUSABLE)

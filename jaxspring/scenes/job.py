@@ -1,0 +1,209 @@
+"""The main job from an image to a folder: fit, measure, and write report, mesh and pictures.
+
+The folder appears at the end, whole. Until then there is only a checkpoint beside it, which a later call may go on from; in the end it moves
+into the folder.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import json
+import math
+import pathlib
+import platform
+import shutil
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+
+from .._version import __version__
+from ..archive import atomic_folder, write_archive
+from ..images.files import ImageError
+from ..images.image import Image
+from ..inverse.checkpoint import Checkpoint
+from ..inverse.fit import Iteration
+from ..inverse.stopping import StopReason
+from ..progress import Stopwatch, draw_bar
+from .pictures import draw_pictures, triangle_corners
+from .reconstruction.fitting import Reconstructed, SpringSettings, fit_springs
+
+CHECKPOINT = "checkpoint.npz"
+PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "equinox", "optax", "optimistix", "lineax", "diffrax", "matplotlib", "pillow")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a job ended.
+
+    Attributes:
+        iterations: updates done.
+        is_interrupted: by Ctrl-C; there is a checkpoint to go on from.
+        failure: one line, or empty where the folder was written.
+        table: the errors, for the terminal.
+        pictures: names of the pictures written.
+    """
+
+    iterations: int
+    is_interrupted: bool = False
+    failure: str = ""
+    table: str = ""
+    pictures: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Job:
+    """What is to be done.
+
+    Attributes:
+        image: the data.
+        name: what the image is called in the report.
+        nodes: (ny, nx) of the mesh.
+        parameters: what is fitted.
+        n_iterations: updates of the parameters.
+        out: the folder for the results.
+    """
+
+    image: Image
+    name: str
+    nodes: tuple[int, int]
+    parameters: tuple[str, ...]
+    n_iterations: int
+    out: pathlib.Path
+
+    def run(self, resume: bool) -> Outcome:
+        """Fit and write.
+
+        Raises:
+            ImageError: the image is too small for a surface.
+            CheckpointError: the checkpoint is damaged or of another problem.
+            OSError: there is no checkpoint to go on from, or the folder cannot be written.
+        """
+        if min(self.image.shape) < 2:
+            raise ImageError(
+                f"{self.name}: {self.image.shape[0]} x {self.image.shape[1]} pixels hold no surface; 2 x 2 are needed at least."
+            )
+        place = self._checkpoint(resume)
+        clock, bar = Stopwatch(), _Bar(self)
+        found = fit_springs(self.image, self._settings(), bar, place, resume)
+        done = len(found.fit.history.loss) - 1
+        if found.fit.reason is StopReason.INTERRUPTED:
+            return Outcome(done, is_interrupted=True)
+        status = found.fit.status.then(found.status)
+        if not bool(status.is_ok):
+            return Outcome(done, failure=f"the fit failed after {done} iterations: {status.describe()}.")
+        report = self._report(found, bar, clock.seconds)
+        with atomic_folder(self.out) as folder:
+            (folder / "report.json").write_text(json.dumps(report, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+            write_archive(folder / "mesh.npz", mesh_arrays(found), {"kind": "mesh"})
+            pictures = draw_pictures(folder, self.image, found)
+            shutil.copyfile(place.path, folder / CHECKPOINT)
+        pathlib.Path(place.path).unlink()
+        return Outcome(done, table=table(report), pictures=pictures)
+
+    def _settings(self) -> SpringSettings:
+        return SpringSettings(nodes=self.nodes, n_iterations=self.n_iterations)
+
+    def _checkpoint(self, resume: bool) -> Checkpoint:
+        """Where the fit is saved: beside the folder, so that the folder is never half full."""
+        beside = self.out.absolute().with_name(self.out.absolute().name + "." + CHECKPOINT)
+        if resume and not beside.exists():
+            finished = self.out / CHECKPOINT
+            if not finished.exists():
+                raise FileNotFoundError(f"--resume: there is no checkpoint of {self.out}; run without --resume first.")
+            shutil.copyfile(finished, beside)
+        pixels = np.ascontiguousarray(self.image.values)
+        digest = hashlib.sha256(pixels.data).hexdigest()[:16]
+        note = f"image {self.image.shape[0]}x{self.image.shape[1]} {digest}, nodes {self.nodes[0]}x{self.nodes[1]}, {','.join(self.parameters)}"
+        return Checkpoint(str(beside), every=25, note=note)
+
+    def _report(self, found: Reconstructed, bar: _Bar, seconds: float) -> dict[str, Any]:
+        history, values = found.fit.history, np.asarray(self.image.values)
+        of_call = history.seconds[bar.first :]
+        run = float(np.sum(of_call[1:]))
+        compile_ = max(float(of_call[0]) - (run / max(len(of_call) - 1, 1)), 0.0)
+        return {
+            "image": {"name": self.name, "pixels": list(self.image.shape)},
+            "settings": {"nodes": list(self.nodes), "parameters": list(self.parameters), "iterations": self.n_iterations},
+            "versions": versions(),
+            "rmse": {
+                name: {"sampled": errors.sampled, "best": errors.best}
+                for name, errors in (("uniform", found.uniform), ("law", found.law.rmse), ("fitted", found.fitted.rmse))
+            },
+            "folds": found.fitted.folds,
+            "folds_at_worst": max(bar.folds, found.fitted.folds),
+            "outside": found.fitted.outside,
+            "range": [float(values.min()), float(values.max())],
+            "seconds": {"compile": compile_, "run": run, "other": max(seconds - run - compile_, 0.0), "total": seconds},
+            "iterations": {"done": len(history.loss) - 1, "best": found.fit.iteration, "ended": found.fit.reason.value},
+            "loss": history.loss.tolist(),
+            "parameters": {"before": summary(found.law_stiffness), "after": summary(found.stiffness)},
+        }
+
+
+class _Bar:
+    """The progress bar, and what has to be seen in every iteration."""
+
+    def __init__(self, job: Job):
+        values = np.asarray(job.image.values)
+        self.total, self.extent = job.n_iterations, float(values.max() - values.min())
+        self.first, self.folds = -1, 0
+
+    def __call__(self, iteration: Iteration) -> None:
+        if self.first < 0:
+            self.first = iteration.index
+        self.folds = max(self.folds, int(iteration.info.n_folds))
+        errors = (
+            f"rmse {float(iteration.info.rms_sampled) * self.extent:.4g} sampled, {float(iteration.info.rms_best) * self.extent:.4g} best"
+        )
+        draw_bar("fit", min(iteration.index, self.total), self.total, note=errors)
+
+
+def mesh_arrays(found: Reconstructed) -> dict[str, np.ndarray]:
+    """The fitted mesh: `points` (N, 3) with the best heights, `z_sampled` (N,), `triangles` (T, 3), `edges` (E, 2), `stiffness` (E,) [N/m].
+
+    x and y are in the unit of the image's spacing (pixels for the command), z in that of its values.
+    """
+    mesh, net = found.fitted, found.scene.net
+    points = np.stack([np.ravel(a) for a in (mesh.x, mesh.y, mesh.z_best)], axis=-1).astype(np.float64)
+    return {
+        "points": points,
+        "z_sampled": np.ravel(mesh.z_sampled),
+        "triangles": triangle_corners(mesh.flip),
+        "edges": np.asarray(net.edges),
+        "stiffness": np.asarray(found.stiffness),
+    }
+
+
+def summary(stiffness: Any) -> dict[str, float]:
+    """Smallest, median and largest stiffness [N/m], and how many; all of them are in mesh.npz."""
+    k = np.asarray(stiffness, np.float64)
+    return {"smallest": float(k.min()), "median": float(np.median(k)), "largest": float(k.max()), "count": int(k.size)}
+
+
+def versions() -> dict[str, str]:
+    """Versions of what the numbers depend on."""
+    found = {"jaxspring": __version__, "python": platform.python_version(), "device": jax.devices()[0].device_kind}
+    for package in PACKAGES:
+        try:
+            found[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def table(report: dict[str, Any]) -> str:
+    """The errors of the three meshes, and their ratios to the uniform one."""
+    rmse = report["rmse"]
+    lines = [f"{'rmse':10} {'sampled':>12} {'best':>12}   {'uniform / it':>14}"]
+    for name, errors in rmse.items():
+        ratios = [rmse["uniform"][rule] / errors[rule] if errors[rule] else math.nan for rule in ("sampled", "best")]
+        lines.append(f"{name:10} {errors['sampled']:12.5g} {errors['best']:12.5g}   {ratios[0]:6.2f} {ratios[1]:7.2f}")
+    seconds = report["seconds"]
+    lines.append(
+        f"{report['iterations']['done']} iterations in {seconds['run']:.1f} s, after {seconds['compile']:.1f} s of compiling; "
+        f"{report['folds']} folded triangles, {report['outside']} pixels outside the mesh"
+    )
+    return "\n".join(lines)

@@ -1,0 +1,107 @@
+"""Pictures of a reconstruction: the image with both meshes, what they recover, where they err, and how the loss fell. Needs the extra `viz`."""
+
+from __future__ import annotations
+
+import pathlib
+from typing import Any
+
+import numpy as np
+
+from ..images.image import Image
+from .reconstruction.fitting import Reconstructed
+from .reconstruction.report import uniform_errors
+from .reconstruction.triangles import corners
+
+DPI = 130
+
+
+def draw_pictures(folder: pathlib.Path, image: Image, found: Reconstructed) -> tuple[str, ...]:
+    """Write the pictures into a folder; returns their names.
+
+    Raises:
+        ImportError: matplotlib is not installed.
+    """
+    try:
+        # Not pyplot: it would choose a window system, and keep every figure.
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ImportError("Pictures need matplotlib: pip install jaxspring[viz]") from error
+    values = np.asarray(image.values, np.float64)
+    width = min(6.0, 4.5 * max(image.shape[1] / image.shape[0], 0.5))
+    uniform_sampled, uniform_best = uniform_errors(found.scene)[1:]
+    surfaces = {
+        "uniform": (uniform_sampled, uniform_best),
+        "slides' law": (found.law.image_sampled, found.law.image_best),
+        "fitted": (found.fitted.image_sampled, found.fitted.image_best),
+    }
+    drawings = {
+        "meshes.png": lambda: _meshes(Figure((3 * width, 5), DPI, layout="constrained"), image, values, found),
+        "reconstructions.png": lambda: _reconstructions(Figure((4 * width, 5), DPI, layout="constrained"), image, values, surfaces),
+        "errors.png": lambda: _errors(Figure((3 * width, 10), DPI, layout="constrained"), image, values, surfaces),
+        "loss.png": lambda: _loss(Figure((7, 4), DPI, layout="constrained"), found),
+    }
+    for name, draw in drawings.items():
+        figure = draw()
+        FigureCanvasAgg(figure)
+        figure.savefig(folder / name, metadata={"Software": None})
+    return tuple(drawings)
+
+
+def triangle_corners(flip: np.ndarray) -> np.ndarray:
+    """(T, 3) node numbers of every triangle of a lattice whose cells are cut along `flip`."""
+    ny, nx = (n + 1 for n in flip.shape)
+    return np.stack([np.ravel(corner) for corner in corners(np.arange(ny * nx).reshape(ny, nx), flip)], axis=-1)
+
+
+def _extent(image: Image) -> tuple[float, float, float, float]:
+    """Outer edges of the outermost pixels, for rows that run down."""
+    (ny, nx), (sx, sy), (ox, oy) = image.shape, map(float, image.spacing), map(float, image.origin)
+    return (ox - sx / 2, ox + (nx - 0.5) * sx, oy + (ny - 0.5) * sy, oy - sy / 2)
+
+
+def _meshes(figure: Any, image: Image, values: np.ndarray, found: Reconstructed) -> Any:
+    x, y = (np.asarray(a) for a in found.scene.rest)
+    straight = np.zeros_like(found.fitted.flip)
+    panels = (("image", None), ("uniform mesh", (x, y, straight)), ("fitted mesh", (found.fitted.x, found.fitted.y, found.fitted.flip)))
+    for axes, (title, mesh) in zip(figure.subplots(1, 3), panels, strict=True):
+        axes.imshow(values, cmap="gray", extent=_extent(image))
+        if mesh is not None:
+            axes.triplot(np.ravel(mesh[0]), np.ravel(mesh[1]), triangle_corners(mesh[2]), color="tab:orange", linewidth=0.35)
+        axes.set_title(title)
+        axes.set_axis_off()
+    return figure
+
+
+def _reconstructions(figure: Any, image: Image, values: np.ndarray, surfaces: dict[str, tuple[np.ndarray, np.ndarray]]) -> Any:
+    panels = [("image", values), *((f"{name}, best heights", best) for name, (_, best) in surfaces.items())]
+    for axes, (title, picture) in zip(figure.subplots(1, 4), panels, strict=True):
+        shown = axes.imshow(picture, cmap="gray", extent=_extent(image), vmin=values.min(), vmax=values.max())
+        axes.set_title(title)
+        axes.set_axis_off()
+    figure.colorbar(shown, ax=figure.axes, shrink=0.8, label="value")
+    return figure
+
+
+def _errors(figure: Any, image: Image, values: np.ndarray, surfaces: dict[str, tuple[np.ndarray, np.ndarray]]) -> Any:
+    """Signed errors under both rules, all on one scale: the 99th percentile of the uniform mesh's."""
+    limit = float(np.percentile(np.abs(surfaces["uniform"][0] - values), 99)) or 1.0
+    rows = figure.subplots(2, 3)
+    for rule, (row, label) in enumerate(zip(rows, ("sampled", "best"), strict=True)):
+        for axes, (name, pair) in zip(row, surfaces.items(), strict=True):
+            error = pair[rule] - values
+            shown = axes.imshow(error, cmap="RdBu_r", extent=_extent(image), vmin=-limit, vmax=limit)
+            axes.set_title(f"{name}, {label}: rmse {np.sqrt(np.mean(error**2)):.4g}")
+            axes.set_axis_off()
+    figure.colorbar(shown, ax=figure.axes, shrink=0.8, label="surface - image")
+    return figure
+
+
+def _loss(figure: Any, found: Reconstructed) -> Any:
+    axes = figure.subplots()
+    axes.plot(found.fit.history.loss, color="tab:blue")
+    axes.axvline(found.fit.iteration, color="tab:orange", linewidth=0.8, label=f"lowest, iteration {found.fit.iteration}")
+    axes.set_xlabel("iteration")
+    axes.set_ylabel("loss (logarithm of the error)")
+    axes.legend()
+    return figure

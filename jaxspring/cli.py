@@ -144,7 +144,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="LIST",
         help=f"what is fitted: stiffness (one per spring, the default), k_pixel, or some of {','.join(LAW)}",
     )
-    fit.add_argument("--iterations", type=iterations, default=300, metavar="N", help="updates of the parameters (300)")
+    fit.add_argument("--iterations", type=iterations, default=600, metavar="N", help="updates of the parameters (600)")
     fit.add_argument("--out", metavar="DIR", help="folder for the results (jaxspring-<image>); an older result there is replaced")
     fit.add_argument("--resume", action="store_true", help="go on from the checkpoint of an interrupted or finished run with the same DIR")
     return parser

@@ -1,7 +1,7 @@
 """The main job from an image to a folder: fit, measure, and write report, mesh and pictures.
 
-The folder appears at the end, whole. Until then there is only a checkpoint beside it, which a later call may go on from; in the end it moves
-into the folder.
+The folder appears at the end, whole. Until then there is only a checkpoint beside it, which a later call may go on from; in the end it
+moves into the folder.
 """
 
 from __future__ import annotations
@@ -82,9 +82,8 @@ class Job:
             OSError: there is no checkpoint to go on from, or the folder cannot be written.
         """
         if min(self.image.shape) < 2:
-            raise ImageError(
-                f"{self.name}: {self.image.shape[0]} x {self.image.shape[1]} pixels hold no surface; 2 x 2 are needed at least."
-            )
+            size = "{} x {}".format(*self.image.shape)
+            raise ImageError(f"{self.name}: {size} pixels hold no surface; an image needs 2 x 2 at least.")
         place = self._checkpoint(resume)
         clock, bar = Stopwatch(), _Bar(self)
         found = fit_springs(self.image, self._settings(), bar, place, resume)
@@ -116,7 +115,8 @@ class Job:
             shutil.copyfile(finished, beside)
         pixels = np.ascontiguousarray(self.image.values)
         digest = hashlib.sha256(pixels.data).hexdigest()[:16]
-        note = f"image {self.image.shape[0]}x{self.image.shape[1]} {digest}, nodes {self.nodes[0]}x{self.nodes[1]}, {','.join(self.parameters)}"
+        size, nodes = ("{}x{}".format(*pair) for pair in (self.image.shape, self.nodes))
+        note = f"image {size} {digest}, nodes {nodes}, {','.join(self.parameters)}"
         return Checkpoint(str(beside), every=25, note=note)
 
     def _report(self, found: Reconstructed, bar: _Bar, seconds: float) -> dict[str, Any]:
@@ -155,9 +155,8 @@ class _Bar:
         if self.first < 0:
             self.first = iteration.index
         self.folds = max(self.folds, int(iteration.info.n_folds))
-        errors = (
-            f"rmse {float(iteration.info.rms_sampled) * self.extent:.4g} sampled, {float(iteration.info.rms_best) * self.extent:.4g} best"
-        )
+        sampled, best = (float(rms) * self.extent for rms in (iteration.info.rms_sampled, iteration.info.rms_best))
+        errors = f"rmse {sampled:.4g} sampled, {best:.4g} best"
         draw_bar("fit", min(iteration.index, self.total), self.total, note=errors)
 
 

@@ -1,10 +1,14 @@
-"""Pictures of a reconstruction: the image with both meshes, what they recover, where they err, and how the loss fell. Needs the extra `viz`."""
+"""Pictures of a reconstruction: the image with both meshes, what they recover, where they err, and how the loss fell.
+
+Needs the extra `viz`.
+"""
 
 from __future__ import annotations
 
 import pathlib
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from ..images.image import Image
@@ -51,7 +55,7 @@ def draw_pictures(folder: pathlib.Path, image: Image, found: Reconstructed) -> t
 def triangle_corners(flip: np.ndarray) -> np.ndarray:
     """(T, 3) node numbers of every triangle of a lattice whose cells are cut along `flip`."""
     ny, nx = (n + 1 for n in flip.shape)
-    return np.stack([np.ravel(corner) for corner in corners(np.arange(ny * nx).reshape(ny, nx), flip)], axis=-1)
+    return np.stack([np.ravel(corner) for corner in corners(jnp.arange(ny * nx).reshape(ny, nx), jnp.asarray(flip))], axis=-1)
 
 
 def _extent(image: Image) -> tuple[float, float, float, float]:
@@ -76,10 +80,10 @@ def _meshes(figure: Any, image: Image, values: np.ndarray, found: Reconstructed)
 def _reconstructions(figure: Any, image: Image, values: np.ndarray, surfaces: dict[str, tuple[np.ndarray, np.ndarray]]) -> Any:
     panels = [("image", values), *((f"{name}, best heights", best) for name, (_, best) in surfaces.items())]
     for axes, (title, picture) in zip(figure.subplots(1, 4), panels, strict=True):
-        shown = axes.imshow(picture, cmap="gray", extent=_extent(image), vmin=values.min(), vmax=values.max())
+        axes.imshow(picture, cmap="gray", extent=_extent(image), vmin=values.min(), vmax=values.max())
         axes.set_title(title)
         axes.set_axis_off()
-    figure.colorbar(shown, ax=figure.axes, shrink=0.8, label="value")
+    figure.colorbar(figure.axes[0].images[0], ax=figure.axes, shrink=0.8, label="value")
     return figure
 
 
@@ -90,10 +94,10 @@ def _errors(figure: Any, image: Image, values: np.ndarray, surfaces: dict[str, t
     for rule, (row, label) in enumerate(zip(rows, ("sampled", "best"), strict=True)):
         for axes, (name, pair) in zip(row, surfaces.items(), strict=True):
             error = pair[rule] - values
-            shown = axes.imshow(error, cmap="RdBu_r", extent=_extent(image), vmin=-limit, vmax=limit)
+            axes.imshow(error, cmap="RdBu_r", extent=_extent(image), vmin=-limit, vmax=limit)
             axes.set_title(f"{name}, {label}: rmse {np.sqrt(np.mean(error**2)):.4g}")
             axes.set_axis_off()
-    figure.colorbar(shown, ax=figure.axes, shrink=0.8, label="surface - image")
+    figure.colorbar(figure.axes[0].images[0], ax=figure.axes, shrink=0.8, label="surface - image")
     return figure
 
 

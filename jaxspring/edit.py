@@ -90,7 +90,9 @@ def _find(system: System, name: str, effect: int | None) -> int:
     if not having:
         raise ValueError(f"no force of this system has a {name}: it holds {', '.join(names) or 'no force'}. Build it with one that has.")
     if len(having) > 1:
-        raise ValueError(f"{name} is ambiguous.{_where(name, having, names)} Say which, e.g. replace(system, {name}=..., effect={having[0]}).")
+        raise ValueError(
+            f"{name} is ambiguous.{_where(name, having, names)} Say which, e.g. replace(system, {name}=..., effect={having[0]})."
+        )
     return having[0]
 
 

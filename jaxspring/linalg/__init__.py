@@ -1,0 +1,1 @@
+"""Linear solvers that report how they ended."""

@@ -18,7 +18,7 @@ def spd(rng):
 
 
 def test_solution_is_numpys(spd, rng):
-    """x equals numpy.linalg.solve to the tolerance, and the residual reported is the true one."""
+    """The solution equals numpy.linalg.solve to the tolerance, and the residual reported is the true one."""
     b = rng.standard_normal(30)
     x, info = JaxCG(tolerance=1e-12).solve(lambda v: jnp.asarray(spd) @ v, jnp.asarray(b))
     np.testing.assert_allclose(x, np.linalg.solve(spd, b), rtol=1e-10)
@@ -42,7 +42,7 @@ def test_vectors_are_solved_as_they_are(rng):
 
 @pytest.mark.parametrize("scale", [1e-30, 1e-200, 1e200])
 def test_scale_of_the_right_hand_side_does_not_matter(spd, rng, scale):
-    """x is linear in b over 400 decades: nothing underflows."""
+    """The solution is linear in b over 400 decades: nothing underflows."""
     b = rng.standard_normal(30)
     x, info = JaxCG(tolerance=1e-12).solve(lambda v: jnp.asarray(spd) @ v, jnp.asarray(b * scale))
     np.testing.assert_allclose(np.asarray(x) / scale, np.linalg.solve(spd, b), rtol=1e-9)
@@ -111,7 +111,7 @@ def test_failed_backward_solve_gives_nan(spd, rng):
 
 
 def test_batches_are_solved_lane_by_lane(spd, rng):
-    """vmap over right-hand sides of different difficulty equals the loop."""
+    """A vmap over right-hand sides of different difficulty equals the loop."""
     b = jnp.asarray(rng.standard_normal((3, 30)))
     x, info = jax.vmap(lambda b: JaxCG(tolerance=1e-12).solve(lambda v: jnp.asarray(spd) @ v, b))(b)
     np.testing.assert_allclose(x, np.linalg.solve(spd, b.T).T, rtol=1e-9)

@@ -1,0 +1,142 @@
+"""The main job: fit one stiffness per spring, by gradients through the rollout, until the mesh recovers the image.
+
+The start is the slides' law. Then each iteration relaxes the mesh by a rollout from where the last one ended, evaluates the loss and
+follows its gradient; every 25 iterations each cell may change its diagonal. At the end the mesh is brought to rest and measured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+
+from ...images.image import Image
+from ...inverse.checkpoint import Checkpoint
+from ...inverse.fit import Fit, Iteration, fit
+from ...inverse.optimisers import Adam
+from ...progress import Progress
+from ...state import State
+from ...status import Status
+from .loss import Carried, SpringLoss, SurfaceError, begin
+from .report import Errors, Surface, measure, uniform_errors
+from .scene import Reconstruction, Relaxation
+from .stiffness_map import StiffnessMap
+
+# The law moves its mesh in short runs between which the stiffness follows; the small step leaves room for a stiffness that grows.
+LAW_RUN = Relaxation(n_steps=10, dt=1.0, damping=0.15)
+LAW_UPDATES = 60
+# The fitted mesh at the end: long, and damped for modes far slower than those of an even mesh.
+FINAL_RUN = Relaxation(n_steps=3000, dt=1.3, damping=0.03)
+
+
+@dataclass(frozen=True)
+class SpringSettings:
+    """How one stiffness per spring is fitted. The defaults serve every image.
+
+    Attributes:
+        nodes: (ny, nx) of the mesh.
+        n_iterations: gradient steps.
+        learning_rate: of Adam at the start, on the variables of `StiffnessMap`; it falls along a cosine to a twentieth.
+        momentum: of Adam.
+        k_min, k_max: of the slides' law that the fit starts from [N/m]; only their ratio matters.
+        sigma: width of the law's Gaussian, in distances between nodes.
+        weight: share of the least-squares rule in the loss.
+        relaxation: the rollout of each iteration.
+    """
+
+    nodes: tuple[int, int] = (41, 41)
+    n_iterations: int = 600
+    learning_rate: float = 0.1
+    momentum: float = 0.95
+    k_min: float = 1.0
+    k_max: float = 30.0
+    sigma: float = 0.25
+    weight: float = 0.9
+    relaxation: Relaxation = Relaxation()  # noqa: RUF009 (frozen, holds no array)
+
+
+@dataclass(frozen=True)
+class Reconstructed:
+    """What `fit_springs` returns.
+
+    Attributes:
+        scene: image and lattice.
+        uniform: errors of the bilinear spline on the regular grid.
+        law, fitted: surfaces of the slides' law before the fit, and of the fitted springs, both at rest.
+        law_stiffness, stiffness: (E,) [N/m] before and after.
+        carried: the fitted mesh, to go on from.
+        fit: history, status and reason of the fit.
+        status: of the last relaxation.
+    """
+
+    scene: Reconstruction
+    uniform: Errors
+    law: Surface
+    fitted: Surface
+    law_stiffness: Any
+    stiffness: Any
+    carried: Carried
+    fit: Fit
+    status: Status
+
+
+def prepare_springs(image: Image, settings: SpringSettings) -> tuple[SpringLoss, Carried]:
+    """The loss, and what its first evaluation starts from: the mesh of the slides' law. `loss.springs.zero()` are its variables."""
+    scene = Reconstruction(image, settings.nodes)
+    rule = scene.law(settings.k_min, settings.k_max, settings.sigma * scene.spacing)
+    stiffness, mesh = _adapt(scene, rule)
+    loss = SpringLoss(SurfaceError(scene, settings.weight), StiffnessMap.around(scene.net, stiffness), settings.relaxation)
+    return loss, begin(scene, stiffness, mesh.position)
+
+
+def fit_springs(
+    image: Image,
+    settings: SpringSettings | None = None,
+    on_iteration: Callable[[Iteration], bool | None] | None = None,
+    checkpoint: Checkpoint | None = None,
+    resume: bool = False,
+    progress: Progress | None = None,
+) -> Reconstructed:
+    """Recover an image with a spring mesh whose stiffnesses are fitted through the rollout.
+
+    Args:
+        image: the data; node positions are in the unit of its spacing.
+        settings: see `SpringSettings`.
+        on_iteration: called after each evaluation, as in `fit`.
+        checkpoint: where and how often to save, as in `fit`.
+        resume: go on from the checkpoint.
+        progress: shows a bar.
+
+    Raises:
+        ValueError: an image or a mesh too small for a surface.
+    """
+    settings = SpringSettings() if settings is None else settings
+    loss, carried = prepare_springs(image, settings)
+    start = loss.springs.zero()
+    law = measure(loss.error, settle(loss, start, carried)[0])
+    optimiser = Adam(settings.learning_rate, settings.momentum, decay_over=settings.n_iterations)
+    found = fit(loss, start, optimiser, settings.n_iterations, on_iteration, carried, None, None, checkpoint, resume, progress)
+    mesh, status = settle(loss, found.parameters, found.best_carried)
+    uniform, _, _ = uniform_errors(loss.error.scene)
+    before, after = loss.springs.stiffness(start), loss.springs.stiffness(found.parameters)
+    return Reconstructed(loss.error.scene, uniform, law, measure(loss.error, mesh), before, after, mesh, found, status)
+
+
+def settle(loss: SpringLoss, variables: Any, carried: Carried) -> tuple[Carried, Status]:
+    """The mesh of `variables` brought to rest from the one in `carried`."""
+    stiffness = loss.springs.stiffness(variables)
+    result = _relax(loss.error.scene, stiffness, carried)
+    x, y = result.state.position
+    return eqx.tree_at(lambda c: (c.x, c.y, c.mass_of), carried, (x, y, stiffness)), result.status
+
+
+@eqx.filter_jit
+def _relax(scene: Reconstruction, stiffness: Any, carried: Carried) -> Any:
+    return scene.relax(stiffness, scene.at_rest(carried.x, carried.y), FINAL_RUN)
+
+
+@eqx.filter_jit
+def _adapt(scene: Reconstruction, rule: Any) -> tuple[Any, State]:
+    return scene.adapt(rule, LAW_RUN, LAW_UPDATES)

@@ -1,0 +1,152 @@
+"""What does the gradient with respect to every stiffness and rest length cost, in time and memory?
+
+    python -m benchmarks.gradient [--quick]
+
+The loss is the sum of squares of the last positions of a rollout in float32. Read: `over_bare` is the time of loss and gradient over one
+bare forward scan of the same steps, timed in the same interleaved rounds; `temporary_mib` is the compiled program's own count of temporary
+memory; the error is that of the gradient against float64, relative to its largest entry, after the checked number of steps.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import numpy as np
+
+import jaxspring as js
+
+from . import scenes
+from .measure import Case, arguments, measure, show, write
+
+DT = np.float32(0.05)
+CHECKED_STEPS = 30
+
+
+def lattices(sizes: list[tuple[int, int]], rounds: int) -> list[dict]:
+    """One row per size."""
+    rows = []
+    for n, n_steps in sizes:
+        system, state = scenes.sheet(n)
+        bare, k, l = scenes.bare_sheet(system.net, system, n_steps)
+        timed = measure(
+            [
+                Case("bare", bare, (list(state.position), list(state.velocity), k, l, DT)),
+                Case("gradient", *scenes.gradient_program(system, state, DT, n_steps)),
+            ],
+            rounds,
+        )
+        rows.append({"n": n, "steps": n_steps, **_row(timed, "bare"), "error": error(system, state)})
+    return rows
+
+
+def graphs(sizes: list[tuple[int, int]], rounds: int) -> list[dict]:
+    """One row per size: the default against both reductions and the autodiff of the bare scatter form."""
+    rows = []
+    for n_nodes, n_steps in sizes:
+        system, state = scenes.mesh(n_nodes)
+        default = type(system.net.reduction).__name__
+        k, l = (system.net.split(a).families[0] for a in (system.forces[0].stiffness, system.forces[0].rest_length))
+        x, v = list(state.position), list(state.velocity)
+        bare = scenes.bare_graph(system.net, n_steps)
+        by_hand = jax.jit(jax.grad(lambda kl, x, v, dt, bare=bare: sum((a * a).sum() for a in bare(x, v, *kl, dt))))
+        cases = [Case("bare", bare, (x, v, k, l, DT)), Case("bare scatter, autodiff", by_hand, ((k, l), x, v, DT))]
+        for kind in (js.Gather, js.Scatter):
+            cases.append(Case(kind.__name__, *scenes.gradient_program(scenes.mesh(n_nodes, reduction=kind)[0], state, DT, n_steps)))
+        timed = measure(cases, rounds)
+        rows.append(
+            {
+                "nodes": n_nodes,
+                "steps": n_steps,
+                "default": default,
+                **{f"{name}_over_bare": timed[name].run_s / timed["bare"].run_s for name in ("Gather", "Scatter")},
+                "autodiff_over_bare": timed["bare scatter, autodiff"].run_s / timed["bare"].run_s,
+                "default_over_autodiff": timed[default].run_s / timed["bare scatter, autodiff"].run_s,
+                "compile_s": timed[default].compile_s,
+                "temporary_mib": timed[default].temporary_mib,
+                "autodiff_mib": timed["bare scatter, autodiff"].temporary_mib,
+                "error": error(system, state),
+            }
+        )
+    return rows
+
+
+def memory() -> list[dict]:
+    """Temporary memory of gradients over many steps of a 10 x 10 cloth, float64, by the compiled program's own analysis."""
+    rows = []
+    with jax.enable_x64(True):
+        system, state = _in_float64(*scenes.sheet(10))
+        for n_steps, observe in ((1_000, False), (10_000, False), (10_007, False), (10_000, True)):
+            function, arrays = scenes.gradient_program(system, state, 0.01, n_steps, observe)
+            mib = function.lower(*arrays).compile().memory_analysis().temp_size_in_bytes / 2**20
+            rows.append({"nodes": 100, "steps": n_steps, "observe": observe, "temporary_mib": mib})
+    return rows
+
+
+def error(system: js.System, state: js.State) -> float:
+    """Largest error of the float32 gradient against float64, over its largest entry."""
+    function, arrays = scenes.gradient_program(system, state, DT, CHECKED_STEPS)
+    found = function(*arrays)
+    with jax.enable_x64(True):
+        function, arrays = scenes.gradient_program(*_in_float64(system, state), np.float64(DT), CHECKED_STEPS)
+        expected = function(*arrays)
+    pairs = zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True)
+    return max(float(np.abs(np.asarray(a, float) - np.asarray(b)).max() / np.abs(np.asarray(b)).max()) for a, b in pairs)
+
+
+def picture(lattice_rows: list[dict], graph_rows: list[dict], path: Path) -> None:
+    """Cost of the gradient against size."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    left.semilogx([row["n"] ** 2 for row in lattice_rows], [row["over_bare"] for row in lattice_rows], "o-", label="loss and gradient")
+    left.axhline(6, color="0.6", linestyle="--", label="bound: 6")
+    left.set(xlabel="nodes", ylabel="time / bare forward scan", title="cloth, 6 spring families", ylim=(0, None))
+    sizes = [row["nodes"] for row in graph_rows]
+    for name, style in (("Gather", "o-"), ("Scatter", "s--"), ("autodiff", "^:")):
+        right.semilogx(sizes, [row[f"{name}_over_bare"] for row in graph_rows], style, label=name.replace("autodiff", "autodiff, bare scatter"))
+    right.set(xlabel="nodes", ylabel="time / bare forward scan", title="Delaunay mesh", ylim=(0, None))
+    for axes in (left, right):
+        axes.legend(fontsize=8)
+        axes.grid(alpha=0.3)
+    figure.savefig(path, dpi=150)
+
+
+def main() -> None:
+    """Measure, print, write the table and the picture."""
+    quick = arguments(__doc__).quick
+    rounds = 3 if quick else 9
+    lattice_rows = lattices([(32, 1000)] if quick else [(32, 1000), (128, 400), (512, 100)], rounds)
+    graph_rows = graphs([(1000, 200)] if quick else [(1000, 1000), (10_000, 200), (100_000, 30)], rounds)
+    memory_rows = memory()
+    show("lattices", lattice_rows)
+    show("graphs", graph_rows)
+    show("memory", memory_rows)
+    tables = {"lattices": lattice_rows, "graphs": graph_rows, "memory": memory_rows}
+    path = write("gradient", {"dt": DT, "dtype": "float32", "rounds": rounds}, tables)
+    picture(lattice_rows, graph_rows, path.with_suffix(".png"))
+
+
+def _row(timed: dict, base: str) -> dict:
+    gradient = timed["gradient"]
+    return {
+        "over_bare": gradient.run_s / timed[base].run_s,
+        "seconds": gradient.run_s,
+        "low_s": gradient.low_s,
+        "high_s": gradient.high_s,
+        "compile_s": gradient.compile_s,
+        "temporary_mib": gradient.temporary_mib,
+    }
+
+
+def _in_float64(system: js.System, state: js.State) -> tuple[js.System, js.State]:
+    def widen(leaf):
+        return leaf.astype(np.float64) if eqx.is_inexact_array(leaf) else leaf
+
+    return jax.tree.map(widen, system), jax.tree.map(widen, state)
+
+
+if __name__ == "__main__":
+    main()

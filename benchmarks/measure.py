@@ -1,0 +1,133 @@
+"""What every benchmark here shares: timing, memory, errors, tables, pictures, and where results go.
+
+Timings are taken after compilation, block until the result is there, and are interleaved: one run of every case, then the next round,
+so that a ratio compares moments close in time. The median and the spread (10 to 90 %) are kept.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+RESULTS = Path(__file__).parent / "results"
+
+
+@dataclass
+class Case:
+    """One thing to time: a jitted function and its arguments."""
+
+    name: str
+    function: Any
+    arguments: tuple[Any, ...]
+
+
+@dataclass
+class Row:
+    """What was measured of a case."""
+
+    name: str
+    compile_s: float
+    run_s: float
+    low_s: float
+    high_s: float
+    temporary_mib: float
+    error: float | None = None
+
+
+def measure(cases: list[Case], rounds: int = 9) -> dict[str, Row]:
+    """Compile each case, then time them in interleaved rounds."""
+    compiled, rows, times = {}, {}, {case.name: [] for case in cases}
+    for case in cases:
+        start = time.perf_counter()
+        program = case.function.lower(*case.arguments).compile()
+        seconds = time.perf_counter() - start
+        memory = program.memory_analysis()
+        compiled[case.name] = program
+        rows[case.name] = Row(case.name, seconds, 0.0, 0.0, 0.0, memory.temp_size_in_bytes / 2**20)
+        jax.block_until_ready(program(*case.arguments))
+    for _ in range(rounds):
+        for case in cases:
+            start = time.perf_counter()
+            jax.block_until_ready(compiled[case.name](*case.arguments))
+            times[case.name].append(time.perf_counter() - start)
+    for name, taken in times.items():
+        rows[name].run_s = float(np.median(taken))
+        rows[name].low_s, rows[name].high_s = (float(q) for q in np.quantile(taken, [0.1, 0.9]))
+    return rows
+
+
+def ratio_of_pairs(case: Callable[[], Any], base: Callable[[], Any], pairs: int = 9) -> tuple[float, float, float]:
+    """Median, lowest and highest ratio of times over interleaved pairs (case right after base)."""
+    ratios = []
+    jax.block_until_ready((case(), base()))
+    for _ in range(pairs):
+        start = time.perf_counter()
+        jax.block_until_ready(base())
+        middle = time.perf_counter()
+        jax.block_until_ready(case())
+        ratios.append((time.perf_counter() - middle) / (middle - start))
+    return float(np.median(ratios)), float(min(ratios)), float(max(ratios))
+
+
+def versions() -> dict[str, str]:
+    """What the numbers were measured with."""
+    names = ("jax", "jaxlib", "equinox", "numpy", "jaxspring")
+    found = {}
+    for name in names:
+        try:
+            found[name] = version(name)
+        except Exception:  # noqa: BLE001 (a package run from its folder has no metadata)
+            found[name] = "not installed"
+    device = jax.devices()[0]
+    return {**found, "python": platform.python_version(), "device": f"{device.platform}: {device.device_kind}", "machine": platform.machine()}
+
+
+def write(name: str, settings: dict[str, Any], tables: dict[str, Any]) -> Path:
+    """Write results/NAME.json and return its path."""
+    RESULTS.mkdir(exist_ok=True)
+    path = RESULTS / f"{name}.json"
+    plain = json.loads(json.dumps({"versions": versions(), "settings": settings, **tables}, default=_plain))
+    path.write_text(json.dumps(plain, indent=1) + "\n")
+    return path
+
+
+def show(title: str, rows: list[dict[str, Any]]) -> None:
+    """Print a table."""
+    print(f"\n{title}")
+    if not rows:
+        return
+    columns = list(rows[0])
+    cells = [[_short(row[c]) for c in columns] for row in rows]
+    widths = [max(len(c), *(len(line[i]) for line in cells)) for i, c in enumerate(columns)]
+    print("  " + "  ".join(c.rjust(w) for c, w in zip(columns, widths, strict=True)))
+    for line in cells:
+        print("  " + "  ".join(value.rjust(w) for value, w in zip(line, widths, strict=True)))
+
+
+def arguments(doc: str | None) -> argparse.Namespace:
+    """--quick runs small sizes only, for a look; published numbers use the whole run."""
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="small sizes and few rounds")
+    return parser.parse_args()
+
+
+def _short(value: Any) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Row):
+        return asdict(value)
+    return float(value) if isinstance(value, (np.generic, jax.Array)) else str(value)

@@ -218,6 +218,14 @@ def _spring_energy_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
                 return law.energy(d.dot(d), *(value if j == i else primals[j] for j in (2, 3)))
 
             total = total + jax.jvp(vary, (primals[i],), (tangents[i],))[1]
+    if jax.tree.leaves(tangents[0]):
+        params, static = eqx.partition(law, eqx.is_inexact_array)
+        moved = jax.tree.map(_zero_where_none, tangents[0], params, is_leaf=lambda leaf: leaf is None)
+
+        def vary_law(params: Any) -> Array:
+            return eqx.combine(params, static).energy(d.dot(d), stiffness, rest_length)
+
+        total = total + jax.jvp(vary_law, (params,), (moved,))[1]
     return energy, total
 
 

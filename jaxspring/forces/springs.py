@@ -15,7 +15,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._checks import finite, is_concrete, nonnegative
+from .._checks import finite, is_concrete, nonnegative, positive
 from ..numerics import cast_inexact, tiny
 from ..state import State
 from ..status import Flag
@@ -23,7 +23,7 @@ from ..topology.base import Topology
 from ..topology.edge_field import EdgeField
 from ..vector import Vector
 from .base import Finding, Force, any_refused
-from .laws import Hooke, Law, spring_energy, spring_pull
+from .laws import Hooke, Law, PowerLaw, spring_energy, spring_pull
 
 
 class StiffnessRule(eqx.Module):
@@ -87,6 +87,9 @@ class Springs(Force):
             why = "A negative stiffness pushes without bound. Pass allow_negative_stiffness=True if meant."
             _check_sign("stiffness", self.stiffness, why, any_sign=allow_negative_stiffness)
         _check_sign("rest_length", self.rest_length, "A length cannot be negative.")
+        if isinstance(self.law, PowerLaw):
+            for entry in self.rest_length.families if isinstance(self.rest_length, EdgeField) else (self.rest_length,):
+                positive("rest_length", entry, "The power law divides by it.")
 
     def prepare(self, dtype: Any) -> Springs:
         """Constants as edge fields of `dtype`."""

@@ -208,8 +208,8 @@ def _terms(system: System, state: State, solver: Any) -> Any:
     if isinstance(structure, tuple):
         if system.motion is not None or _reads_velocity(system, state):
             raise ValueError(
-                f"{name} splits position from velocity, so it cannot take forces that depend on velocity (drag, dashpots), nor moved nodes. "
-                f"Use another solver, or rollout with SymplecticEuler() or VelocityVerlet()."
+                f"{name} splits position from velocity, so it cannot take forces that depend on velocity (drag, dashpots), nor moved "
+                f"nodes. Use another solver, or rollout with SymplecticEuler() or VelocityVerlet()."
             )
         return diffrax.ODETerm(_drift), diffrax.ODETerm(_kick)
     if get_origin(structure) is diffrax.MultiTerm:

@@ -23,16 +23,16 @@ def pair(rng):
 
 @pytest.mark.parametrize("op", [operator.add, operator.sub, operator.mul, operator.truediv])
 def test_arithmetic_is_that_of_the_stacked_array(op, pair):
-    """a op b, a op scalar and a op node array are what NumPy gives coordinate by coordinate."""
+    """Vector op vector, number or node array is what NumPy gives coordinate by coordinate."""
     a, b = pair
     weights = jnp.arange(1.0, 11.0).reshape(2, 5)
-    for b, expected in ((b, stacked(b)), (2.5, 2.5), (weights, np.asarray(weights))):
-        np.testing.assert_allclose(stacked(op(a, b)), op(stacked(a), expected), rtol=1e-15)
+    for other, expected in ((b, stacked(b)), (2.5, 2.5), (weights, np.asarray(weights))):
+        np.testing.assert_allclose(stacked(op(a, other)), op(stacked(a), expected), rtol=1e-15)
 
 
 @pytest.mark.parametrize("op", [operator.add, operator.sub, operator.mul])
 def test_arithmetic_from_the_left(op, pair):
-    """scalar op a and array op a are Vectors, for Python, NumPy and JAX operands: never an object array."""
+    """Number op vector and array op vector are Vectors, for Python, NumPy and JAX operands: never an object array."""
     a, _ = pair
     weights = np.arange(1.0, 11.0).reshape(2, 5)
     for left in (2.5, np.float64(2.5), np.float32(2.5), weights, jnp.asarray(weights)):

@@ -94,13 +94,21 @@ class Job:
         if not bool(status.is_ok):
             return Outcome(done, failure=f"the fit failed after {done} iterations: {status.describe()}.")
         report = self._report(found, bar, clock.seconds)
+        try:
+            pictures = self._write(found, report, place)
+        except OSError as error:
+            return Outcome(done, failure=f"the results could not be written ({error}); --resume tries again without fitting anew.")
+        return Outcome(done, table=table(report), pictures=pictures)
+
+    def _write(self, found: Reconstructed, report: dict[str, Any], place: Checkpoint) -> tuple[str, ...]:
+        """Fill the folder, all or nothing; returns the names of the pictures."""
         with atomic_folder(self.out) as folder:
             (folder / "report.json").write_text(json.dumps(report, indent=2, allow_nan=False) + "\n", encoding="utf-8")
             write_archive(folder / "mesh.npz", mesh_arrays(found), {"kind": "mesh"})
             pictures = draw_pictures(folder, self.image, found)
             shutil.copyfile(place.path, folder / CHECKPOINT)
         pathlib.Path(place.path).unlink()
-        return Outcome(done, table=table(report), pictures=pictures)
+        return pictures
 
     def _settings(self) -> SpringSettings:
         return SpringSettings(nodes=self.nodes, n_iterations=self.n_iterations)

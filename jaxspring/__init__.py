@@ -16,7 +16,7 @@ _HOMES = {
     "state": ("State",),
     "system": ("Energy", "Motion", "System", "lumped_mass"),
     "edit": ("replace",),
-    "rollout": ("Result", "Resume", "rollout"),
+    "rollouts": ("Result", "Resume", "rollout"),
     "ode": ("OdeResult", "diffeqsolve"),
     "blocks": ("Checkpointed", "StoreAll"),
     "progress": ("Progress",),

@@ -72,6 +72,10 @@ def run(arguments: Arguments) -> int:
         check_folder(arguments.out)
     except OSError as error:
         return complain(str(error), UNUSABLE)
+    if arguments.parameters != ("stiffness",):
+        return complain(
+            f"--parameters {','.join(arguments.parameters)}: the command fits stiffness only; use the library for these.", UNUSABLE
+        )
     from .archive import CheckpointError
     from .images.files import ImageError
     from .scenes.job import Job

@@ -96,7 +96,7 @@ def settle(advance: Callable[[Carry], Carry], watch: Watch, system: System) -> S
         last, first = lax.while_loop(
             lambda pair: ~jnp.any(_nonfinite(pair[1].state)) & (pair[1].step < status.step),
             lambda pair: (pair[1], advance(pair[1])),
-            (watch.suspect, advance(watch.suspect)),
+            (watch.suspect, watch.suspect),
         )
         node = jnp.argmax(jnp.ravel(_nonfinite(first.state)))
         return first.step, node.astype(jnp.int32), _blame(system, last.state)

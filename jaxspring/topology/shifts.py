@@ -60,11 +60,11 @@ def difference(grid: Grid, x: Array) -> tuple[Array, ...]:
 
 def accumulate(grid: Grid, pulls: tuple[Array, ...]) -> Array:
     """Each pull on its tail, the opposite on its head: minus the transpose of `difference`."""
-    total = jnp.zeros(grid.shape, pulls[0].dtype)
+    total = None
     for offset, pull in zip(grid.offsets, pulls, strict=True):
         tail, head = _at_nodes(grid, inside(grid, pull, offset, 0), offset)
-        total = total + (tail - head)
-    return total
+        total = tail - head if total is None else total + (tail - head)
+    return jnp.zeros(grid.shape) if total is None else total
 
 
 def sum_of_ends(grid: Grid, a: Array) -> tuple[Array, ...]:
@@ -79,11 +79,11 @@ def sum_of_ends(grid: Grid, a: Array) -> tuple[Array, ...]:
 
 def sum_at_nodes(grid: Grid, values: tuple[Array, ...]) -> Array:
     """Sum over the springs at each node: the transpose of `sum_of_ends`."""
-    total = jnp.zeros(grid.shape, values[0].dtype)
+    total = None
     for offset, value in zip(grid.offsets, values, strict=True):
         tail, head = _at_nodes(grid, inside(grid, value, offset, 0), offset)
-        total = total + (tail + head)
-    return total
+        total = tail + head if total is None else total + (tail + head)
+    return jnp.zeros(grid.shape) if total is None else total
 
 
 def inside(grid: Grid, value: Array, offset: Offset, fill: float) -> Array:

@@ -27,7 +27,7 @@ LAYERS = {
     "watch": 6,  # watch, blocks and progress are the parts of a rollout
     "blocks": 6,
     "progress": 6,
-    "rollout": 6,
+    "rollouts": 6,
     "ode": 6,
     "inverse": 7,
     "study": 7,

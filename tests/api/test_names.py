@@ -80,3 +80,9 @@ def test_every_public_name_is_in_the_reference():
     assert not missing, f"docs/api.md does not name, in backquotes: {', '.join(missing)}"
     unknown = sorted({name for name in re.findall(r"\bjs\.([A-Za-z_]\w*)", text) if not hasattr(js, name)})
     assert not unknown, f"docs/api.md names what js does not have: {', '.join(unknown)}"
+
+
+def test_no_public_name_is_also_a_module_of_the_package():
+    """Importing `jaxspring.NAME` as a module would put the module in the place of the function of that name."""
+    modules = {path.stem for path in source.PACKAGE.glob("*.py")} | {path.name for path in source.PACKAGE.iterdir() if path.is_dir()}
+    assert not modules & set(jaxspring.__all__)

@@ -22,7 +22,7 @@ from ...forces.data_springs import DataSprings
 from ...forces.springs import Springs
 from ...images.image import Image
 from ...images.smoothing import smooth, smoothing_radius
-from ...rollout import Result, rollout
+from ...rollouts import Result, rollout
 from ...state import State
 from ...steppers.explicit import SymplecticEuler
 from ...system import System

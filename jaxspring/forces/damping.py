@@ -83,7 +83,11 @@ class Dashpots(Force):
             return Vector.zeros_like(state.position)
 
         def pull(d: Vector, relative: Vector, c: Array) -> Vector:
-            return (c * d.dot(relative) / jnp.maximum(d.dot(d), tiny(d.dtype))) * d
+            squared = d.dot(d)
+            is_long = squared > tiny(squared.dtype)
+            # Both wheres, so that the derivative at length zero is zero and not infinity times zero.
+            rate = c * d.dot(relative) / jnp.where(is_long, squared, jnp.ones_like(squared))
+            return jnp.where(is_long, rate, jnp.zeros_like(rate)) * d
 
         d = self.net.difference(state.position)
         pulls = self.net.map_springs(pull, d, self._rate(state), self.net.edge_field(self.damping))

@@ -23,7 +23,10 @@ from ..topology.base import Topology
 from ..topology.edge_field import EdgeField
 from ..vector import Vector
 from .base import Finding, Force, any_refused
-from .laws import Hooke, Law, PowerLaw, spring_energy, spring_pull
+from .laws import Hooke, Law, PowerLaw, TensionOnly, spring_energy, spring_pull
+
+
+GUARDED = (Hooke, TensionOnly, PowerLaw)  # laws that are finite at length zero, with their derivatives
 
 
 class StiffnessRule(eqx.Module):
@@ -188,7 +191,13 @@ class Springs(Force):
         rule = self.stiffness
         k = rule.stiffness(self.net, state) if isinstance(rule, StiffnessRule) else self.net.edge_field(rule, "stiffness")
         k, l = cast_inexact((k, self.net.edge_field(self.rest_length, "rest_length")), state.dtype)
-        return self.net.difference(self._seen(state)), k, l
+        d = self.net.difference(self._seen(state))
+        return d if isinstance(self.law, GUARDED) else self._filled(d), k, l
+
+    def _filled(self, d: EdgeField) -> EdgeField:
+        """Length above zero in a lattice's margins: there a user's law would be taken at length zero, and its NaN reach the gradient."""
+        columns = [self.net.inside(d.map(lambda v, i=i: v[i]), 1.0).families for i in range(len(d[0]))]
+        return EdgeField(tuple(Vector(parts) for parts in zip(*columns, strict=True)))
 
     def _embed(self, force: Vector, state: State) -> Vector:
         if self.axes is None:

@@ -153,7 +153,7 @@ def _run(
         if progress is not None:
             jax.debug.callback(lambda done: progress.update(done, plan.n_steps), carry.step)
 
-    watch = begin(ready, carry, dt, limit)
+    watch = begin(system, ready, carry, dt, limit)
     keep = _whole_state if observe is None else observe
     (carry, watch), saved = run_blocks(advance, partial(inspect, ready), keep, report, (carry, watch), plan)
     # The replay of a failed block is not part of what is differentiated.

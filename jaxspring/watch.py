@@ -40,24 +40,25 @@ class Watch(eqx.Module):
     suspect: Carry
 
 
-def begin(system: System, carry: Carry, dt: Array, limit: Array | None) -> Watch:
+def begin(system: System, ready: System, carry: Carry, dt: Array, limit: Array | None) -> Watch:
     """Before the first step: constants that a constructor would refuse, a state that is not finite, a dt above the limit, and
-    coordinates too large for the springs between them.
+    coordinates too large for the springs between them. The constants are read as the user gave them (`system`), which is one array
+    where the prepared system (`ready`) holds one for every spring family.
     """
-    system, carry, dt, limit = stopped((system, carry, dt, limit))
+    system, ready, carry, dt, limit = stopped((system, ready, carry, dt, limit))
     status = Status.ok()
     for i, effect in enumerate(system.forces):
         bad = effect.invalid()
         if bad is not None:
             status = status.then(Status.when(Flag.INVALID, bad, step=carry.step, effect=i))
         status = status.then(Status.when(Flag.NONFINITE, _has_nonfinite(effect), step=carry.step, effect=i))
-        rounding = effect.rounding(carry.state)
+        rounding = ready.forces[i].rounding(carry.state)
         if rounding is not None:
             # Forces good to three digits or worse: the threshold is a choice.
             status = status.then(Status.when(Flag.PRECISION, rounding > 1e-3, step=carry.step, effect=i))
     status = status.then(Status.when(Flag.INVALID, ~jnp.all(system.mass > 0), step=carry.step))
     status = status.then(Status.when(Flag.NONFINITE, _has_nonfinite(system.mass), step=carry.step))
-    status = status.then(look(system, carry))
+    status = status.then(look(ready, carry))
     if limit is not None:
         # A hair of slack: a dt set to the limit itself is not above it after rounding.
         slack = jnp.asarray(1 + 8 * float(jnp.finfo(limit.dtype).eps), limit.dtype)

@@ -8,7 +8,6 @@ Source: slide "Force Computation" (length |r|, deformation e = |r| - l).
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -168,18 +167,12 @@ class Springs(Force):
         if self.net.n_springs == 0:
             return None
         d, _, l = self._along(state)
-
-        def shortest(d: Vector, l: Array) -> Array:
-            length = d.norm()
-            never = jnp.full_like(length, jnp.inf)
-            return jnp.where(l > 0, jnp.minimum(jnp.where(length > 0, length, never), l), never)
-
-        def longest_without_rest(d: Vector, l: Array) -> Array:
-            length = d.norm()
-            return jnp.where(l > 0, jnp.zeros_like(length), length)
-
-        finest = _extreme(jnp.min, self.net.inside(self.net.map_springs(shortest, d, l), jnp.inf))
-        longest = _extreme(jnp.max, self.net.inside(self.net.map_springs(longest_without_rest, d, l), 0.0))
+        # Flat, so that two reductions serve all families.
+        length = self.net.flatten(d.map(lambda family: family.norm()))
+        rest = self.net.flatten(l) if isinstance(l, EdgeField) else jnp.broadcast_to(l, length.shape)
+        never = jnp.full_like(length, jnp.inf)
+        finest = jnp.min(jnp.where(rest > 0, jnp.minimum(jnp.where(length > 0, length, never), rest), never))
+        longest = jnp.max(jnp.where(rest > 0, jnp.zeros_like(length), length))
         length = jnp.where(longest > 0, jnp.minimum(finest, longest), finest)
         largest = jnp.max(jnp.stack([jnp.max(jnp.abs(a)) for a in self._seen(state)]))
         return largest * jnp.asarray(jnp.finfo(state.dtype).eps, state.dtype) / length
@@ -229,10 +222,6 @@ def _edge_constant(net: Topology, name: str, value: Any) -> Any:
     value = as_inexact(name, value)
     has_shape(name, value, {"one number": (), "one per spring": (net.n_springs,)})
     return value
-
-
-def _extreme(reduce: Callable[[Array], Array], field: EdgeField) -> Array:
-    return reduce(jnp.stack([reduce(entry) for entry in field.families]))
 
 
 def _check_sign(name: str, value: Any, why: str, any_sign: bool = False) -> None:

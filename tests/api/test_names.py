@@ -84,5 +84,5 @@ def test_every_public_name_is_in_the_reference():
 
 def test_no_public_name_is_also_a_module_of_the_package():
     """Importing `jaxspring.NAME` as a module would put the module in the place of the function of that name."""
-    modules = {path.stem for path in source.PACKAGE.glob("*.py")} | {path.name for path in source.PACKAGE.iterdir() if path.is_dir()}
-    assert not modules & set(jaxspring.__all__)
+    modules = {path.stem for path in source.LIBRARY.iterdir()}
+    assert not modules & set(js.__all__)

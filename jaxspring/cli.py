@@ -73,9 +73,8 @@ def run(arguments: Arguments) -> int:
     except OSError as error:
         return complain(str(error), UNUSABLE)
     if arguments.parameters != ("stiffness",):
-        return complain(
-            f"--parameters {','.join(arguments.parameters)}: the command fits stiffness only; use the library for these.", UNUSABLE
-        )
+        names = ",".join(arguments.parameters)
+        return complain(f"--parameters {names}: the command fits stiffness only; use the library for these.", UNUSABLE)
     from .archive import CheckpointError
     from .images.files import ImageError
     from .scenes.job import Job

@@ -199,7 +199,8 @@ def as_optimiser(optimiser: Any) -> Optimiser:
     if isinstance(optimiser, optax.GradientTransformation):
         return Optax(optimiser)
     raise TypeError(
-        f"optimiser is a {type(optimiser).__name__}; expected an optax transformation such as optax.sgd(0.1), Adam(), LBFGS() or LeastSquares()."
+        f"optimiser is a {type(optimiser).__name__}; expected an optax transformation such as optax.sgd(0.1), or Adam(), LBFGS(), "
+        "LeastSquares()."
     )
 
 

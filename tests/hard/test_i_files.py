@@ -202,8 +202,9 @@ from jaxspring.inverse.fit import fit
 def loss(p): return jnp.sum((p ** 2 - jnp.arange(5.0)) ** 2)
 def slowly(it):
     print(it.index, flush=True); time.sleep(float(sys.argv[3]))
-result = fit(loss, jnp.ones(5), n_iterations=40, checkpoint=Checkpoint(sys.argv[1], every=1), resume=sys.argv[2] == "resume", on_iteration=slowly)
-print(result.history.loss.tobytes().hex(), result.last.tobytes().hex() if hasattr(result.last, "tobytes") else bytes(result.last).hex())
+result = fit(loss, jnp.ones(5), n_iterations=40, checkpoint=Checkpoint(sys.argv[1], every=1), resume=sys.argv[2] == "resume",
+             on_iteration=slowly)
+print(result.history.loss.tobytes().hex(), bytes(memoryview(result.last)).hex())
 """
 
 

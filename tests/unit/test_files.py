@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import jaxspring as js
-from jaxspring.archive import CheckpointError, read_archive, remove_leftovers, write_archive
+from jaxspring.archive import CheckpointError, atomic_folder, read_archive, remove_leftovers, write_archive
 from jaxspring.files import load, save, save_trajectory
 
 
@@ -125,6 +125,26 @@ def test_leftovers_are_removed(tmp_path):
     assert os.listdir(tmp_path) == [".b.npz.12345678.tmp"]
 
 
+def test_a_folder_appears_whole_or_not_at_all(tmp_path):
+    """New and replaced folders hold all that was written; after an error the old one is as it was, and nothing else is left."""
+    target = tmp_path / "out"
+    for text in ("first", "second"):
+        with atomic_folder(target) as folder:
+            assert not (target / text).exists()
+            (folder / text).touch()
+    assert os.listdir(target) == ["second"]
+
+    def interrupted():
+        with atomic_folder(target) as folder:
+            (folder / "third").touch()
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert os.listdir(tmp_path) == ["out"]
+    assert os.listdir(target) == ["second"]
+
+
 def test_an_archive_keeps_its_note(tmp_path):
     """What the writer noted beside the arrays comes back, and so do no arrays at all."""
     write_archive(tmp_path / "a.npz", {}, {"why": "a test", "n": 3})
@@ -132,6 +152,7 @@ def test_an_archive_keeps_its_note(tmp_path):
     assert (archive.arrays, archive.about) == ({}, {"why": "a test", "n": 3})
 
 
+@pytest.mark.slow
 def test_a_trajectory_opens_in_numpy(tmp_path):
     """Frames, times and edges of a rollout, in the user's order."""
     net = js.Graph.from_edges([[3, 1], [1, 0], [0, 2]], 4)

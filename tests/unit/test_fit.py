@@ -17,7 +17,7 @@ from jaxspring.inverse.checkpoint import Checkpoint
 from jaxspring.inverse.fit import fit
 from jaxspring.inverse.iteration import GradientWarning
 from jaxspring.inverse.losses import squared_distance
-from jaxspring.inverse.optimisers import LBFGS, LeastSquares
+from jaxspring.inverse.optimisers import LBFGS, Adam, LeastSquares
 from jaxspring.inverse.select import select
 from jaxspring.inverse.stopping import Stop, StopReason
 from jaxspring.inverse.transforms import Bounded, Identity, Positive, SoftPositive, to_constrained, to_free, transform_per_leaf
@@ -86,6 +86,14 @@ def test_adam_is_optax_adam():
         np.testing.assert_allclose(result.parameters, p, rtol=1e-12)
     assert result.reason is StopReason.ITERATIONS
     assert len(result.history.loss) == 21
+
+
+def test_adam_may_cool():
+    """With a decay, the rate is optax's cosine: a fit equals one with that schedule, step for step."""
+    cooled = fit(bowl, jnp.zeros(2), Adam(0.2, 0.8, decay_over=8, last_fraction=0.1), n_iterations=10)
+    same = fit(bowl, jnp.zeros(2), optax.adam(optax.cosine_decay_schedule(0.2, 8, 0.1), b1=0.8), n_iterations=10)
+    np.testing.assert_array_equal(cooled.history.loss, same.history.loss)
+    assert cooled.history.loss[-1] != fit(bowl, jnp.zeros(2), Adam(0.2, 0.8), n_iterations=10).history.loss[-1]
 
 
 def test_lbfgs_walks_the_valley():
@@ -315,6 +323,7 @@ def test_transforms_without_sense_are_refused(build):
 # Systems
 
 
+@pytest.mark.slow
 def test_a_system_is_fitted_through_the_rollout():
     """Stiffness and drag of a chain are recovered from where its nodes are after one second."""
     loss = Chain(hang(chain(80.0, 2.0)))
@@ -324,14 +333,16 @@ def test_a_system_is_fitted_through_the_rollout():
     assert float(build(result.parameters).forces[1].gamma) == pytest.approx(2.0, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_a_whole_system_is_a_parameter():
     """All of a system's constants are trained at once, and those of other kinds stay as they are."""
-    result = fit(Chain(hang(chain(80.0, 2.0))), chain(70.0, 2.0), n_iterations=10, transforms={"forces/0": Positive()})
+    result = fit(Chain(hang(chain(80.0, 2.0))), chain(70.0, 2.0), Adam(1e-4), n_iterations=10, transforms={"forces/0": Positive()})
     assert result.value < result.history.loss[0]
     assert result.parameters.net == chain(70.0, 2.0).net
     np.testing.assert_array_equal(result.parameters.free, np.arange(4) > 0)
 
 
+@pytest.mark.slow
 def test_tied_parameters_are_one_value():
     """A value used in two places gets the sum of both gradients, and both places stay equal."""
     loss = Chain(hang(chain(3.0, 3.0)))
@@ -423,6 +434,7 @@ def test_a_checkpoint_of_another_fit_is_refused(tmp_path):
 # The check of gradients
 
 
+@pytest.mark.slow
 def test_check_gradient_agrees_on_a_rollout(user_mode):
     """Every constant of a chain, in float64 though the system is float32, to 1e-9; the Taylor remainder falls as h^2."""
     target = np.zeros((4, 2))

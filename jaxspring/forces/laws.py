@@ -14,7 +14,7 @@ from __future__ import annotations
 import abc
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -27,7 +27,13 @@ from ..vector import Vector
 
 
 class Law(eqx.Module):
-    """Constitutive law of one spring. Abstract. All arguments of the methods broadcast against each other."""
+    """Constitutive law of one spring. Abstract. All arguments of the methods broadcast against each other.
+
+    Attributes:
+        is_finite_at_zero: whether weight, energy and their derivatives are finite at length zero (class attribute).
+    """
+
+    is_finite_at_zero: ClassVar[bool] = False
 
     @abc.abstractmethod
     def weight(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
@@ -45,6 +51,8 @@ class Law(eqx.Module):
 
 class Hooke(Law):
     """Linear law: the pull is k (r - l). Odd under stretch and squeeze; the block is indefinite when squeezed."""
+
+    is_finite_at_zero: ClassVar[bool] = True
 
     def weight(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
         """K (1 - l / r) [N/m]."""
@@ -64,6 +72,8 @@ class Hooke(Law):
 class TensionOnly(Law):
     """Hooke's law when stretched, nothing when squeezed: a rope."""
 
+    is_finite_at_zero: ClassVar[bool] = True
+
     def weight(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
         """K max(0, 1 - l / r) [N/m]."""
         return stiffness * jnp.maximum(1 - rest_length * _inverse_length(squared_length), jnp.zeros((), squared_length.dtype))
@@ -80,6 +90,8 @@ class PowerLaw(Law):
     Attributes:
         exponent: n, at least 1 (1 is Hooke's law).
     """
+
+    is_finite_at_zero: ClassVar[bool] = True
 
     exponent: float = eqx.field(static=True, default=3.0)
 

@@ -22,10 +22,7 @@ from ..topology.base import Topology
 from ..topology.edge_field import EdgeField
 from ..vector import Vector
 from .base import Finding, Force, any_refused
-from .laws import Hooke, Law, PowerLaw, TensionOnly, spring_energy, spring_pull
-
-
-GUARDED = (Hooke, TensionOnly, PowerLaw)  # laws that are finite at length zero, with their derivatives
+from .laws import Hooke, Law, PowerLaw, spring_energy, spring_pull
 
 
 class StiffnessRule(eqx.Module):
@@ -185,7 +182,7 @@ class Springs(Force):
         k = rule.stiffness(self.net, state) if isinstance(rule, StiffnessRule) else self.net.edge_field(rule, "stiffness")
         k, l = cast_inexact((k, self.net.edge_field(self.rest_length, "rest_length")), state.dtype)
         d = self.net.difference(self._seen(state))
-        return d if isinstance(self.law, GUARDED) else self._filled(d), k, l
+        return d if self.law.is_finite_at_zero else self._filled(d), k, l
 
     def _filled(self, d: EdgeField) -> EdgeField:
         """Length above zero in a lattice's margins: there a user's law would be taken at length zero, and its NaN reach the gradient."""

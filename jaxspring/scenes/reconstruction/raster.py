@@ -5,10 +5,12 @@ inside. Between two iterations of a fit the mesh moves little, and a few steps s
 knows the answer in closed form. The number of steps is bounded, so a folded mesh ends the walk too; pixels that are then in no triangle
 are counted.
 
-On an edge either triangle will do, because the surface is continuous: a pixel counts as inside within `EDGE_TOLERANCE` of a pixel's area.
+On an edge either triangle will do, because the surface is continuous: a pixel counts as inside within the rounding of the areas compared.
 """
 
 from __future__ import annotations
+
+import math
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -19,7 +21,8 @@ from jaxtyping import Array, Float, Int
 from ...images.image import Image
 from .triangles import OUTSIDE, Flip, Node, corners, neighbours
 
-EDGE_TOLERANCE = 1e-3
+# Rounding of an area, in epsilons of image side times cell side: within it of an edge, a pixel might else be beyond it for both triangles.
+EDGE_ROUNDING = 4.0
 # A walk crosses the mesh in about as many steps as it has cells along both sides; more means that it goes round in circles.
 WALKS = 4
 
@@ -84,8 +87,8 @@ def locate(x: Node, y: Node, flip: Flip, grid: PixelGrid, triangle: Int[Array, "
     vertices = [c.reshape(-1) for a in (x, y) for c in corners(a, flip)]
     n_triangles = 2 * flip.size
     across = neighbours(flip).reshape(-1)
-    pixel_area = (grid.x[-1] - grid.x[0]) * (grid.y[-1] - grid.y[0]) / max((grid.shape[0] - 1) * (grid.shape[1] - 1), 1)
-    tolerance = -EDGE_TOLERANCE * pixel_area
+    image_area = (grid.x[-1] - grid.x[0]) * (grid.y[-1] - grid.y[0])
+    tolerance = -EDGE_ROUNDING * jnp.finfo(x.dtype).eps * image_area / math.sqrt(flip.size)
     most = WALKS * sum(x.shape)
 
     def step(walk: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:

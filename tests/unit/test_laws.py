@@ -197,6 +197,26 @@ def test_a_law_with_an_array_of_its_own(rng):
     np.testing.assert_allclose(jax.vmap(jax.grad(work))(jnp.stack([b, 2 * b]))[0], jax.grad(work)(b), rtol=1e-13)
 
 
+def test_a_law_that_is_infinite_at_length_zero(rng):
+    """A Lennard-Jones energy on a lattice: force and gradient by l are finite and those of NumPy and of differences."""
+    net, state = cloud(rng)
+    law = js.EnergyLaw(lambda r, k, l: k * ((l / r) ** 12 - 2 * (l / r) ** 6))
+
+    @jax.jit
+    def energy(points, l):
+        return js.Springs(net, K, l, law=law).energy(js.State.from_points(net, points))
+
+    def in_numpy(l):
+        ratio = l / np.linalg.norm(np.diff(np.asarray(state.points)[net.edges], axis=1)[:, 0], axis=-1)
+        return (K * (ratio**12 - 2 * ratio**6)).sum()
+
+    l = jnp.asarray(0.8)
+    assert float(energy(state.points, l)) == pytest.approx(in_numpy(0.8), rel=1e-12)
+    by_points, by_length = jax.jit(jax.grad(energy, argnums=(0, 1)))(state.points, l)
+    assert float(by_length) == pytest.approx(reference.central_difference(in_numpy, 0.8, 1e-6), rel=1e-7)
+    np.testing.assert_allclose(flat_force(js.Springs(net, K, l, law=law), net, state.points), -by_points, rtol=1e-10)
+
+
 def test_gradient_of_a_whole_system_reaches_the_law(rng):
     """eqx.filter_grad with respect to a system gives the law's array its gradient, k sum (r - l)^4 / 4."""
     net, state = cloud(rng)

@@ -12,6 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array
 
 
@@ -23,7 +24,7 @@ def shape_of(value: Any) -> tuple[int, ...]:
 def is_concrete(value: Any) -> bool:
     """Whether the numbers in `value` can be looked at now."""
     return isinstance(value, (bool, int, float, np.ndarray, np.generic, list, tuple)) or (
-        isinstance(value, jax.Array) and not isinstance(value, jax.core.Tracer)
+        isinstance(value, jax.Array) and not isinstance(value, Tracer)
     )
 
 

@@ -13,8 +13,8 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import tree_util
+from jax.core import ShapedArray, Tracer
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
@@ -22,7 +22,7 @@ from jaxtyping import Array
 PyTree = Any
 
 
-def tiny(dtype: Any) -> np.generic:
+def tiny(dtype: Any) -> Any:
     """Smallest normal positive number of `dtype`: a squared length below it counts as zero.
 
     >>> print(tiny("float32"))
@@ -66,7 +66,7 @@ def _evaluate(*args, forward, transpose, n_residuals):
 
 def _abstract(*args, forward, transpose, n_residuals):
     shapes = [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in args]
-    return [jax.core.ShapedArray(out.shape, out.dtype) for out in jax.eval_shape(forward, *shapes)]
+    return [ShapedArray(out.shape, out.dtype) for out in jax.eval_shape(forward, *shapes)]
 
 
 def _jvp(primals, tangents, *, forward, transpose, n_residuals):
@@ -150,7 +150,7 @@ def stopped(tree: PyTree) -> PyTree:
 
 def is_traced(*trees: PyTree) -> bool:
     """Whether any leaf is a tracer: inside `jit`, `grad` or `vmap` of this value."""
-    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
 
 
 __all__ = ["Array", "cast_inexact", "is_traced", "linear_call", "stopped", "tiny"]

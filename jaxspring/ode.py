@@ -70,7 +70,8 @@ class OdeResult(eqx.Module):
         if self.info.interpolation is None:
             raise ValueError("this result keeps no interpolation. Pass saveat=diffrax.SaveAt(dense=True) to diffeqsolve.")
         time = jnp.asarray(time, self.state.dtype)
-        return State(time, *self.info.interpolation.evaluate(time), self.state.layout)
+        position, velocity = self.info.interpolation.evaluate(time)
+        return State(time, position, velocity, self.state.layout)
 
 
 def diffeqsolve(
@@ -164,16 +165,18 @@ def _solve(
         throw=False,
         progress_meter=meter,
     )
-    times, frames = (solution.ts, solution.ys) if saveat is None else (solution.ts[1], solution.ys[1])
+    found: Any = solution
+    times, frames = (found.ts, found.ys) if saveat is None else (found.ts[1], found.ys[1])
     last = _as_state(times[0], jax.tree.map(lambda a: a[0], frames), ready)
-    counts = [jnp.asarray(solution.stats[name], jnp.int32) for name in ("num_steps", "num_accepted_steps", "num_rejected_steps")]
-    status = before.then(look(ready, Carry(last, None, counts[0]))).then(_verdict(solution.result, counts[0]))
+    names = ("num_steps", "num_accepted_steps", "num_rejected_steps")
+    n_steps, n_accepted, n_rejected = (jnp.asarray(found.stats[name], jnp.int32) for name in names)
+    status = before.then(look(ready, Carry(last, None, n_steps))).then(_verdict(solution.result, n_steps))
     return OdeResult(
         state=last,
-        saved=None if saveat is None else solution.ys[0],
-        times=None if saveat is None else solution.ts[0],
+        saved=None if saveat is None else found.ys[0],
+        times=None if saveat is None else found.ts[0],
         status=jax.lax.stop_gradient(status),
-        info=OdeInfo(*counts, solution.result, solution.interpolation),
+        info=OdeInfo(n_steps, n_accepted, n_rejected, solution.result, solution.interpolation),
         effects=tuple(type(force).__name__ for force in system.forces),
     )
 
@@ -182,21 +185,21 @@ def _as_state(time: Array, y: Y, system: System) -> State:
     return system.constrain(State(time.astype(y[0].dtype), *y, system.net.layout))
 
 
-def _flow(time: Array, y: Y, system: System) -> Y:
+def _flow(time: Any, y: Any, system: Any) -> Any:
     """Dy/dt. Module-level, so that diffrax compiles it once."""
     state = _as_state(time, y, system)
     return state.velocity, system.acceleration(state)
 
 
-def _drift(time: Array, velocity: Vector, system: System) -> Vector:
+def _drift(time: Any, velocity: Any, system: Any) -> Any:
     return system.hold(velocity)
 
 
-def _kick(time: Array, position: Vector, system: System) -> Vector:
+def _kick(time: Any, position: Any, system: Any) -> Any:
     return _flow(time, (position, Vector.zeros_like(position)), system)[1]
 
 
-def _nothing(time: Array, y: Y, system: System) -> Y:
+def _nothing(time: Any, y: Any, system: Any) -> Any:
     return jax.tree.map(jnp.zeros_like, y)
 
 

@@ -99,7 +99,7 @@ def animate(result: Any, net: Topology, path: str | pathlib.Path, frames_per_sec
     box = _limits(np.concatenate([_flat(frame) for frame in frames]))
     figure = pyplot.figure(layout="constrained")
     axes = figure.add_subplot(projection="3d") if saved.dim == 3 else figure.add_subplot()
-    writer = PillowWriter(fps=frames_per_second)
+    writer = PillowWriter(fps=max(round(frames_per_second), 1))
     try:
         with writer.saving(figure, path, dpi=100):
             for frame in frames:
@@ -124,7 +124,7 @@ def _lines(segments: np.ndarray, net: Topology, color: Any) -> Any:
     from matplotlib.collections import LineCollection
     from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
-    kind = Line3DCollection if segments.shape[-1] == 3 else LineCollection
+    kind: Any = Line3DCollection if segments.shape[-1] == 3 else LineCollection
     if color is None:
         return kind(segments, linewidths=1.0)
     flat = np.asarray(net.flatten(color) if isinstance(color, EdgeField) else color)

@@ -17,6 +17,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array
 
 from ._checks import finite, is_concrete
@@ -122,7 +123,7 @@ def rollout(
     if is_traced(system, state, dt, resume):
         return _compiled(system, state, stepper, dt, plan, observe, resume, progress)
     result = _run_eagerly(system, state, stepper, dt, plan, observe, resume, progress)
-    if bool(result.status.has(Flag.DT_LIMIT)):
+    if result.info.stable_dt is not None and bool(result.status.has(Flag.DT_LIMIT)):
         text = f"dt = {float(dt):.6g} s, but this run is surely stable only up to {float(result.info.stable_dt):.6g} s"
         warnings.warn(f"DT_LIMIT: {EXPLANATION[Flag.DT_LIMIT]}: {text}.", StabilityWarning, stacklevel=2)
     if bool(result.status.has(Flag.PRECISION)):
@@ -143,7 +144,8 @@ def _run(
     """The whole run as one traced program."""
     ready = system.prepare(state.dtype)
     start = ready.constrain(state)
-    limit = dt_limit(*stopped((ready, start)), stepper)
+    still, still_start = stopped((ready, start))
+    limit = dt_limit(still, still_start, stepper)
     memory = stepper.init(ready, start) if isinstance(resume.memory, _Unset) else resume.memory
     carry = Carry(start, memory, resume.step)
 
@@ -151,13 +153,13 @@ def _run(
 
     def report(carry: Carry) -> None:
         if progress is not None:
-            jax.debug.callback(lambda done: progress.update(done, plan.n_steps), carry.step)
+            jax.debug.callback(partial(progress.update, total=plan.n_steps), carry.step)
 
     watch = begin(system, ready, carry, dt, limit)
     keep = _whole_state if observe is None else observe
     (carry, watch), saved = run_blocks(advance, partial(inspect, ready), keep, report, (carry, watch), plan)
     # The replay of a failed block is not part of what is differentiated.
-    still, still_dt, still_time = stopped((ready, dt, resume.start_time))
+    still_dt, still_time = stopped((dt, resume.start_time))
     return Result(
         state=carry.state,
         saved=saved,
@@ -200,7 +202,8 @@ def _run_eagerly(
     """The run in chunks, with the host between them where somebody watches or the run is long."""
     is_long = progress is not None or plan.n_steps * math.prod(state.position.shape) > LONG_RUN
     pieces = plan.pieces(N_CHUNKS) if is_long else [plan]
-    result, frames, done = None, [], 0
+    result: Any = None
+    frames, done = [], 0
     try:
         for piece in pieces:
             latest = _compiled(system, state, stepper, dt, piece, observe, resume)
@@ -239,7 +242,7 @@ def _check_steps(n_steps: int, save_every: int | None, observe: Any, check_every
     for name, value, least in (("n_steps", n_steps, 0), ("save_every", save_every, 1), ("check_every", check_every, 1)):
         if value is None and name != "n_steps":
             continue
-        if isinstance(value, jax.core.Tracer) or not isinstance(value, (int, np.integer)) or isinstance(value, bool):
+        if isinstance(value, Tracer) or not isinstance(value, (int, np.integer)) or isinstance(value, bool):
             raise TypeError(f"{name} = {value!r}; expected a whole number, known when the program is compiled.")
         if value < least:
             raise ValueError(f"{name} = {value}; expected {least} or more.")

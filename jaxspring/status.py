@@ -14,6 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Int, UInt32
 
 
@@ -100,7 +101,7 @@ class Status(eqx.Module):
         return Status(flags, pick(step, NOWHERE), pick(node, NOWHERE), pick(effect, NOWHERE), pick(count, 0))
 
     def then(self, later: Status) -> Status:
-        """This status with a later one: flags are joined; place and count are those of the first error, else of the first warning."""
+        """Joined with a later status: flags are joined; place and count are those of the first error, else of the first warning."""
         warning = jnp.asarray(int(WARNINGS), jnp.uint32)
         nothing = jnp.asarray(0, jnp.uint32)
         worse = ((self.flags & ~warning) == nothing) & ((later.flags & ~warning) != nothing)
@@ -156,7 +157,7 @@ def raise_for_status(result: Any) -> None:
     Inside `jit` a status is a traced value: return it and call this outside.
     """
     status = result if isinstance(result, Status) else result.status
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(status)):
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(status)):
         raise TypeError("raise_for_status was called on a traced status. Return the result from jit, and call it outside.")
     note = getattr(result, "effects", ())
     if not bool(np.all(np.asarray(status.is_ok))):

@@ -136,4 +136,5 @@ def _combine(operation: Callable[[Array, Array], Array], a: Vector, b: Any) -> V
         return NotImplemented
     if isinstance(b, (np.ndarray, np.generic)):
         b = jnp.asarray(b, a.dtype)
-    return Vector(tuple(operation(p, b) for p in a.components))
+    other: Any = b
+    return Vector(tuple(operation(p, other) for p in a.components))

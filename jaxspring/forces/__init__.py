@@ -1,0 +1,1 @@
+"""Forces, and the physics of one spring."""

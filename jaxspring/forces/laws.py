@@ -212,7 +212,10 @@ def _linearised(law: Law, squared: Array, stiffness: Array, rest_length: Array) 
 @eqx.filter_custom_jvp
 def spring_energy(law: Law, d: Vector, stiffness: Array, rest_length: Array) -> Array:
     """Energy of each spring [J]; its derivative by `d` is the pull, guarded alike."""
-    return law.energy(d.dot(d), stiffness, rest_length)
+    energy = law.energy(d.dot(d), stiffness, rest_length)
+    if energy is None:
+        raise TypeError(f"{type(law).__name__} has no energy.")
+    return energy
 
 
 @spring_energy.def_jvp

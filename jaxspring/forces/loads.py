@@ -46,8 +46,8 @@ class Gravity(Force):
     def energy(self, state: State) -> Array:
         """-m g . x, summed [J]; zero at the origin."""
         mass = self._mass()
-        parts = [jnp.sum(mass * a) * g for g, a in zip(self._acceleration(state), state.position, strict=True)]
-        return -sum(parts[1:], start=parts[0])
+        heights = [jnp.sum(mass * a) for a in state.position]
+        return -jnp.dot(self._acceleration(state), jnp.stack(heights))
 
     def _weight(self, g: Array, like: Array) -> Array:
         return jnp.broadcast_to(g * self._mass(), like.shape)

@@ -9,6 +9,7 @@ limit is that much larger than what `stable_dt` returns.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import jax.numpy as jnp
@@ -52,22 +53,20 @@ def dt_limit(system: System, state: State, stepper: Stepper) -> Array | None:
 def _bounds(system: System, state: State) -> tuple[Array, Array, Array]:
     """Squared frequency, damping rate and its floor, over the free nodes."""
     inverse = 1 / system.mass.astype(state.dtype)
-    zero = jnp.zeros((), state.dtype)
-    stiffness: Any = zero
-    damping: Any = zero
-    floor: Any = zero
-    for effect in system.forces:
-        for found, which in ((effect.stiffness_bound(state), "k"), (effect.damping_bound(state), "c"), (effect.damping_floor(state), "f")):
-            if found is not None:
-                found = found.astype(state.dtype)
-                stiffness = stiffness + found if which == "k" else stiffness
-                damping = damping + found if which == "c" else damping
-                floor = floor + found if which == "f" else floor
-    held = [m for m in system.free_masks(state.dim)]
-    free = None if any(m is None for m in held) else jnp.any(jnp.stack([jnp.broadcast_to(m, state.position.shape) for m in held]), axis=0)
+    stiffness = _total(state, (effect.stiffness_bound(state) for effect in system.forces))
+    damping = _total(state, (effect.damping_bound(state) for effect in system.forces))
+    floor = _total(state, (effect.damping_floor(state) for effect in system.forces))
+    held = system.free_masks(state.dim)
+    masks = [jnp.broadcast_to(m, state.position.shape) for m in held if m is not None]
+    free = jnp.any(jnp.stack(masks), axis=0) if len(masks) == len(held) else None
 
     def extreme(rate: Array, reduce: Any, otherwise: float) -> Array:
         rate = jnp.broadcast_to(rate * inverse, state.position.shape)
         return reduce(rate if free is None else jnp.where(free, rate, jnp.full_like(rate, otherwise)))
 
     return extreme(stiffness, jnp.max, 0.0), extreme(damping, jnp.max, 0.0), extreme(floor, jnp.min, jnp.inf)
+
+
+def _total(state: State, bounds: Iterable[Array | None]) -> Array:
+    """Sum of the bounds that there are, numbers or node arrays."""
+    return sum((bound.astype(state.dtype) for bound in bounds if bound is not None), start=jnp.zeros((), state.dtype))

@@ -51,9 +51,7 @@ def main(folder):
     FigureCanvasAgg(figure)
     target = pathlib.Path(__file__).with_suffix(".png")
     figure.savefig(target, metadata={"Software": None})
-    PIL.Image.open(target).convert("RGB").quantize(256).save(
-        target, optimize=True
-    )
+    PIL.Image.open(target).convert("RGB").quantize(256).save(target, optimize=True)
 
 
 if __name__ == "__main__":

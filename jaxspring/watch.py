@@ -46,7 +46,9 @@ def begin(system: System, ready: System, carry: Carry, dt: Array, limit: Array |
     where the prepared system (`ready`) holds one for every spring family.
     """
     system, ready, carry, dt, limit = stopped((system, ready, carry, dt, limit))
-    status = Status.ok()
+    # Masses first: gravity holds them too, and would be blamed.
+    status = Status.when(Flag.INVALID, ~jnp.all(system.mass > 0), step=carry.step)
+    status = status.then(Status.when(Flag.NONFINITE, _has_nonfinite(system.mass), step=carry.step))
     for i, effect in enumerate(system.forces):
         bad = effect.invalid()
         if bad is not None:
@@ -56,8 +58,6 @@ def begin(system: System, ready: System, carry: Carry, dt: Array, limit: Array |
         if rounding is not None:
             # Forces good to three digits or worse: the threshold is a choice.
             status = status.then(Status.when(Flag.PRECISION, rounding > 1e-3, step=carry.step, effect=i))
-    status = status.then(Status.when(Flag.INVALID, ~jnp.all(system.mass > 0), step=carry.step))
-    status = status.then(Status.when(Flag.NONFINITE, _has_nonfinite(system.mass), step=carry.step))
     status = status.then(look(ready, carry))
     if limit is not None:
         # A hair of slack: a dt set to the limit itself is not above it after rounding.

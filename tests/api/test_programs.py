@@ -1,0 +1,214 @@
+"""What the compiled programs hold: no scatter, and only the operations that the scene names. Read from their StableHLO."""
+
+import re
+from collections import Counter
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+import jaxspring as js
+from jaxspring.images import Image
+
+SHEET = js.lattice((5, 6), js.STRUCTURAL + js.SHEAR + js.BEND)
+GATHERED = js.Graph.from_edges(SHEET.edges[::-1], 30, reduction=js.Gather)
+
+# Operations that move or repeat nothing at run time: the compiler folds them into the loops that read them.
+FOLDED = {"constant", "broadcast_in_dim", "convert", "reshape", "negate"}
+
+
+def operations(program):
+    """How often each StableHLO operation is executed, calls of inner functions followed (a loop's body counts once)."""
+    text = program.as_text()
+    bodies = {m[1]: m[2] for m in re.finditer(r"func\.func [a-z]+ @(\S+?)\((.*?)\n  }", text, re.DOTALL)}
+
+    def count(name):
+        total = Counter(re.findall(r"(?<!#)stablehlo\.([a-z_]+)", bodies[name]))
+        total.pop("return", None)  # of a loop's body
+        for inner in re.findall(r"\bcall @([\w.]+)\(", bodies[name]):
+            total += count(inner)
+        return total
+
+    return count("main")
+
+
+def seen(program):
+    """As `operations`, without those that the compiler folds."""
+    return Counter({name: n for name, n in operations(program).items() if name not in FOLDED})
+
+
+def loss_of(net):
+    """Loss of a rollout as a function of flat k and l in the user's order."""
+    points = np.c_[1.1 * SHEET.grid(), np.zeros(30)]
+
+    def loss(k, l):
+        system = js.System(net, 1.0, (js.Springs(net, k, l), js.Drag(0.1)))
+        end = js.rollout(system, js.State.from_points(net, points), js.SymplecticEuler(), 1e-2, 20, save_every=5).state
+        return jnp.sum(end.points**2)
+
+    return loss
+
+
+@pytest.mark.parametrize("net", [SHEET, GATHERED], ids=["lattice", "graph"])
+def test_no_scatter(net):
+    """Forward, gradient, batched gradient and Hessian-vector product hold no scatter, with k and l flat in the user's order."""
+    loss = loss_of(net)
+    k, l = (np.full(net.n_springs, c) for c in (20.0, 1.0))
+    gradient = jax.grad(loss, argnums=(0, 1))
+    programs = {
+        "forward": jax.jit(loss).lower(k, l),
+        "gradient": jax.jit(gradient).lower(k, l),
+        "batch": jax.jit(jax.vmap(gradient)).lower(np.stack([k, k]), np.stack([l, l])),
+        "curvature": jax.jit(lambda k, l: jax.jvp(lambda k: gradient(k, l), (k,), (k,))).lower(k, l),
+    }
+    for name, program in programs.items():
+        assert "scatter" not in program.as_text(), name
+
+
+def test_a_scatter_would_show():
+    """The test above can fail: the other kind of graph does scatter."""
+    net = js.Graph.from_edges(SHEET.edges, 30, reduction=js.Scatter)
+    k, l = (np.full(net.n_springs, c) for c in (20.0, 1.0))
+    assert "scatter" in jax.jit(loss_of(net)).lower(k, l).as_text()
+
+
+# A chain in the plane: one family, so that the step fits on a page. The library keeps springs on an extended range.
+CHAIN, N = js.lattice(8), 8
+
+
+def minimal_force(x, y, k, l):
+    """Hooke's law on a chain by hand, for components and springs -1 ... n - 1 of which the first and last do not exist."""
+
+    def difference(a):
+        padded = lax.pad(a, np.zeros((), a.dtype), [(1, 1, 0)])
+        return existing(padded[1:] - padded[:-1])
+
+    def existing(p):
+        place = lax.broadcasted_iota(np.int32, (N + 1,), 0)
+        return lax.select((place >= 1) & (place < N), p, jnp.zeros_like(p))
+
+    def on_nodes(p):
+        p = existing(p)
+        return p[1:] - p[:-1]
+
+    dx, dy = difference(x), difference(y)
+    weight = k * (1 - l * lax.rsqrt(jnp.maximum(dx * dx + dy * dy, jnp.finfo(x.dtype).tiny)))
+    return on_nodes(weight * dx), on_nodes(weight * dy)
+
+
+def minimal_step(x, y, vx, vy, k, l, m, dt):
+    """The slides' update by hand."""
+    fx, fy = minimal_force(x, y, k, l)
+    w = 1 / m
+    vx, vy = vx + dt * (w * fx), vy + dt * (w * fy)
+    return x + dt * vx, y + dt * vy, vx, vy
+
+
+def library_step(*effects, dim=2):
+    """A step of the library, prepared as `rollout` does once before its loop."""
+    springs = js.Springs(CHAIN, np.full(N - 1, 10.0), np.ones(N - 1))
+    system = js.System(CHAIN, 1.0, (springs, *effects))
+    state = js.State.from_points(CHAIN, np.eye(N, dim))
+
+    def step(system, state, dt):
+        return js.SymplecticEuler().step(system, state, dt, None)[0]
+
+    return jax.jit(step).lower(system.prepare(state.dtype), state, jnp.asarray(1e-2))
+
+
+def minimal(*shapes):
+    return [jnp.zeros(shape) for shape in shapes]
+
+
+def test_a_step_of_springs_holds_a_minimal_step():
+    """A springs-only step has exactly the operations of the step written by hand."""
+    by_hand = jax.jit(minimal_step).lower(*minimal(N, N, N, N, N + 1, N + 1, (), ()))
+    assert seen(library_step()) == seen(by_hand)
+    # And these are: differences, lengths, the law, sums on the nodes, the update.
+    assert {"subtract", "multiply", "add", "maximum", "rsqrt", "divide"} <= set(seen(by_hand))
+    assert seen(by_hand)["rsqrt"] == 1
+    assert seen(by_hand)["divide"] == 1  # by the mass, once
+
+
+def minimal_rollout(x, y, vx, vy, k, l, m, dt):
+    """The hand-written steps in two nested loops, with the time."""
+
+    def step(carry, _):
+        state, i = carry
+        i = i + 1
+        return ((*minimal_step(*state[:4], k, l, m, dt), i.astype(dt.dtype) * dt), i), None
+
+    def block(carry, _):
+        return lax.scan(step, carry, None, length=10)[0], None
+
+    return lax.scan(block, ((x, y, vx, vy, jnp.zeros_like(dt)), jnp.zeros((), jnp.int32)), None, length=10)[0]
+
+
+# What looking for trouble takes: is it finite, where, what each effect reports, whether the constants are ones a constructor would take,
+# and the replay of a failed block.
+OF_STATUSES = {"is_finite", "not", "or", "and", "reduce", "select", "compare", "maximum", "minimum", "abs", "concatenate", "sqrt", "iota"}
+OF_STATUSES |= {"case", "while", "add", "subtract", "multiply", "divide", "rsqrt", "pad", "slice"}
+
+
+def lowered_rollout(what):
+    springs = js.Springs(CHAIN, np.full(N - 1, 10.0), np.ones(N - 1))
+    system = js.System(CHAIN, 1.0, springs)
+    state = js.State.from_points(CHAIN, np.c_[np.arange(float(N)), np.zeros(N)])
+
+    def run(system, state, dt):
+        return what(js.rollout(system, state, js.SymplecticEuler(), dt, 100))
+
+    return jax.jit(run).lower(system, state, jnp.asarray(1e-2))
+
+
+def test_a_rollout_adds_the_statuses_alone():
+    """A rollout whose status nobody asks for is the hand-written loop; with it, only what finding trouble takes is added."""
+    bare = seen(jax.jit(minimal_rollout).lower(*minimal(N, N, N, N, N + 1, N + 1, (), ())))
+    stateless = seen(lowered_rollout(lambda result: result.state))
+    # Outside the loop k and l are cut into families and brought to the extended range; in it, the start time is added to i dt.
+    more = stateless - bare
+    assert not bare - stateless
+    assert more == Counter(slice=2, pad=2, add=1)
+    full = seen(lowered_rollout(lambda result: (result.state, result.status)))
+    assert set(full - stateless) <= OF_STATUSES
+
+
+def force_alone(effect, dim):
+    state = js.State.from_points(CHAIN, np.zeros((N, dim)))
+    ready = js.System(CHAIN, 1.0, effect).prepare(state.dtype)
+    return jax.jit(lambda system, state: system.forces[0].force(state)).lower(ready, state)
+
+
+@pytest.mark.parametrize(
+    ("effect", "theirs"),
+    [
+        (js.Drag(0.1), {"multiply": 2}),
+        (js.Gravity((0.0, -9.81)), {"slice": 2, "multiply": 2}),
+    ],
+    ids=["drag", "gravity"],
+)
+def test_an_effect_adds_its_own_operations(effect, theirs):
+    """Drag and gravity add their own product per coordinate and one sum per coordinate, and nothing else."""
+    plain, with_effect = seen(library_step()), seen(library_step(effect))
+    assert seen(force_alone(effect, 2)) == Counter(theirs)
+    assert with_effect - plain == Counter(theirs) + Counter(add=2)
+    assert not plain - with_effect
+
+
+def test_an_image_adds_its_own_operations():
+    """Data springs add the reading of the image at the nodes, one product and one difference, and one sum per coordinate."""
+    data = js.DataSprings(Image(np.eye(8)), 1.0)
+    plain, with_image = seen(library_step(dim=3)), seen(library_step(data, dim=3))
+    alone = seen(force_alone(data, 3))
+    assert alone["gather"] == 4  # the corners of a cell
+    assert "scatter" not in alone
+    assert with_image == plain + alone + Counter(add=3)
+
+
+def test_no_heat_no_cost():
+    """A state holds time, position and velocity, and nothing that the scene does not name."""
+    state = js.State.from_points(CHAIN, np.zeros((N, 2)))
+    assert len(jax.tree.leaves(eqx.filter(state, eqx.is_array))) == 5

@@ -13,10 +13,12 @@ LAYERS = {
     "numerics": 0,
     "status": 0,
     "vector": 0,
+    "archive": 0,  # files of arrays, whole or not at all
     "topology": 1,
     "images": 1,
     "linalg": 2,
     "state": 2,  # a topology and its node fields; forces read it
+    "files": 3,
     "forces": 3,
     "thermal": 3,
     "system": 4,

@@ -114,7 +114,7 @@ class Reconstruction(eqx.Module):
         The slides smooth the gradient instead, G_sigma * |grad d|; on photographs that observes noise (fitted by hand, it was worth at most
         1.06 on the camera photograph, this 1.25). `radius`: half width of the Gaussian in pixels, needed where sigma is traced.
         """
-        return ImageStiffness(smooth(self.image, sigma, radius), k_min, k_max, 0.0)
+        return ImageStiffness(smooth(self.image, sigma, radius), k_min, k_max, 0.0, radius=0)
 
     def smoothing_radius(self, sigma: float) -> int:
         """Pixels that a Gaussian of `sigma` [m] needs."""

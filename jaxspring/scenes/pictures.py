@@ -64,6 +64,11 @@ def _extent(image: Image) -> tuple[float, float, float, float]:
     return (ox - sx / 2, ox + (nx - 0.5) * sx, oy + (ny - 0.5) * sy, oy - sy / 2)
 
 
+def _label(axes: Any) -> None:
+    axes.set(xlabel="x (unit of the pixel spacing)", ylabel="y (unit of the pixel spacing)")
+    axes.label_outer()
+
+
 def _meshes(figure: Any, image: Image, values: np.ndarray, found: Reconstructed) -> Any:
     x, y = (np.asarray(a) for a in found.scene.rest)
     straight = np.zeros_like(found.fitted.flip)
@@ -73,7 +78,7 @@ def _meshes(figure: Any, image: Image, values: np.ndarray, found: Reconstructed)
         if mesh is not None:
             axes.triplot(np.ravel(mesh[0]), np.ravel(mesh[1]), triangle_corners(mesh[2]), color="tab:orange", linewidth=0.35)
         axes.set_title(title)
-        axes.set_axis_off()
+        _label(axes)
     return figure
 
 
@@ -82,8 +87,8 @@ def _reconstructions(figure: Any, image: Image, values: np.ndarray, surfaces: di
     for axes, (title, picture) in zip(figure.subplots(1, 4), panels, strict=True):
         axes.imshow(picture, cmap="gray", extent=_extent(image), vmin=values.min(), vmax=values.max())
         axes.set_title(title)
-        axes.set_axis_off()
-    figure.colorbar(figure.axes[0].images[0], ax=figure.axes, shrink=0.8, label="value")
+        _label(axes)
+    figure.colorbar(figure.axes[0].images[0], ax=figure.axes, shrink=0.8, label="value (image's unit)")
     return figure
 
 
@@ -96,8 +101,8 @@ def _errors(figure: Any, image: Image, values: np.ndarray, surfaces: dict[str, t
             error = pair[rule] - values
             axes.imshow(error, cmap="RdBu_r", extent=_extent(image), vmin=-limit, vmax=limit)
             axes.set_title(f"{name}, {label}: rmse {np.sqrt(np.mean(error**2)):.4g}")
-            axes.set_axis_off()
-    figure.colorbar(figure.axes[0].images[0], ax=figure.axes, shrink=0.8, label="surface - image")
+            _label(axes)
+    figure.colorbar(figure.axes[0].images[0], ax=figure.axes, shrink=0.8, label="surface - image (image's unit)")
     return figure
 
 
@@ -105,7 +110,7 @@ def _loss(figure: Any, found: Reconstructed) -> Any:
     axes = figure.subplots()
     axes.plot(found.fit.history.loss, color="tab:blue")
     axes.axvline(found.fit.iteration, color="tab:orange", linewidth=0.8, label=f"lowest, iteration {found.fit.iteration}")
-    axes.set_xlabel("iteration")
-    axes.set_ylabel("loss (logarithm of the error)")
+    axes.set_xlabel("iteration (1)")
+    axes.set_ylabel("loss, log of the error (1)")
     axes.legend()
     return figure

@@ -63,7 +63,8 @@ def parse(argv: Sequence[str]) -> Arguments:
     given = _parser().parse_args(argv)
     image = None if given.image is None else pathlib.Path(given.image)
     out = pathlib.Path(given.out or f"jaxspring-{'elevation' if image is None else image.stem or 'image'}")
-    return Arguments(image, given.nodes, given.parameters, given.iterations, out, given.resume)
+    updates = given.iterations if given.iterations is not None else 600 if given.parameters == ("stiffness",) else 100
+    return Arguments(image, given.nodes, given.parameters, updates, out, given.resume)
 
 
 def run(arguments: Arguments) -> int:
@@ -72,9 +73,6 @@ def run(arguments: Arguments) -> int:
         check_folder(arguments.out)
     except OSError as error:
         return complain(str(error), UNUSABLE)
-    if arguments.parameters != ("stiffness",):
-        names = ",".join(arguments.parameters)
-        return complain(f"--parameters {names}: the command fits stiffness only; use the library for these.", UNUSABLE)
     from .archive import CheckpointError
     from .images.files import ImageError
     from .scenes.job import Job
@@ -147,7 +145,9 @@ def _parser() -> argparse.ArgumentParser:
         metavar="LIST",
         help=f"what is fitted: stiffness (one per spring, the default), k_pixel, or some of {','.join(LAW)}",
     )
-    fit.add_argument("--iterations", type=iterations, default=600, metavar="N", help="updates of the parameters (600)")
+    fit.add_argument(
+        "--iterations", type=iterations, metavar="N", help="updates of the parameters (600 of the stiffness, 100 of other constants)"
+    )
     fit.add_argument("--out", metavar="DIR", help="folder for the results (jaxspring-<image>); an older result there is replaced")
     fit.add_argument("--resume", action="store_true", help="go on from the checkpoint of an interrupted or finished run with the same DIR")
     return parser

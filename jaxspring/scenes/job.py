@@ -28,6 +28,7 @@ from ..inverse.fit import Iteration
 from ..inverse.stopping import StopReason
 from ..progress import Stopwatch, draw_bar
 from .pictures import draw_pictures, triangle_corners
+from .reconstruction.constants import Constants, ConstantsSettings, fit_constants
 from .reconstruction.fitting import Reconstructed, SpringSettings, fit_springs
 
 CHECKPOINT = "checkpoint.npz"
@@ -86,7 +87,7 @@ class Job:
             raise ImageError(f"{self.name}: {size} pixels hold no surface; an image needs 2 x 2 at least.")
         place = self._checkpoint(resume)
         clock, bar = Stopwatch(), _Bar(self)
-        found = fit_springs(self.image, self._settings(), bar, place, resume)
+        found = self._fit(bar, place, resume)
         done = len(found.fit.history.loss) - 1
         if found.fit.reason is StopReason.INTERRUPTED:
             return Outcome(done, is_interrupted=True)
@@ -110,8 +111,22 @@ class Job:
         pathlib.Path(place.path).unlink()
         return pictures
 
-    def _settings(self) -> SpringSettings:
-        return SpringSettings(nodes=self.nodes, n_iterations=self.n_iterations)
+    def _fit(self, bar: _Bar, place: Checkpoint, resume: bool) -> Reconstructed:
+        if self.parameters == ("stiffness",):
+            settings = SpringSettings(nodes=self.nodes, n_iterations=self.n_iterations)
+            return fit_springs(self.image, settings, bar, place, resume)
+        of_constants = ConstantsSettings(nodes=self.nodes, n_iterations=self.n_iterations)
+        return fit_constants(self.image, self.parameters, of_constants, bar, place, resume)
+
+    def _values(self, found: Reconstructed) -> dict[str, dict[str, float]]:
+        """What was fitted, before and after: the constants by name, or a summary of all stiffnesses."""
+        if self.parameters == ("stiffness",):
+            return {"before": summary(found.law_stiffness), "after": summary(found.stiffness)}
+        usual = Constants.usual(found.scene)
+        return {
+            "before": {name: float(getattr(usual, name)) for name in self.parameters},
+            "after": {name: float(found.fit.parameters[name]) for name in self.parameters},
+        }
 
     def _checkpoint(self, resume: bool) -> Checkpoint:
         """Where the fit is saved: beside the folder, so that the folder is never half full."""
@@ -147,7 +162,7 @@ class Job:
             "seconds": {"compile": compile_, "run": run, "other": max(seconds - run - compile_, 0.0), "total": seconds},
             "iterations": {"done": len(history.loss) - 1, "best": found.fit.iteration, "ended": found.fit.reason.value},
             "loss": history.loss.tolist(),
-            "parameters": {"before": summary(found.law_stiffness), "after": summary(found.stiffness)},
+            "parameters": self._values(found),
         }
 
 

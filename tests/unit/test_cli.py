@@ -242,3 +242,16 @@ def check_failure_leaves_nothing(hill, capsys, monkeypatch):
     assert "the results could not be written (No space left on device); --resume tries again" in capsys.readouterr().err
     assert pathlib.Path("whole/report.json").read_text() == before
     assert sorted(os.listdir()) == ["broken", hill, "whole", "whole.checkpoint.npz"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("names", ["k_min,k_max,sigma,k_data,drag", "k_pixel"])
+def test_the_constants_of_the_slides_mesh_are_fitted(tmp_path, names):
+    """Each named constant is reported before and after, and moved; the loss fell."""
+    out = tmp_path / "out"
+    assert cli.main(["fit", "--nodes", "9x9", "--parameters", names, "--iterations", "6", "--out", str(out)]) == 0
+    report = json.loads((out / "report.json").read_text())
+    before, after = report["parameters"]["before"], report["parameters"]["after"]
+    assert set(before) == set(after) == set(names.split(","))
+    assert all(before[name] != after[name] > 0 for name in before)
+    assert min(report["loss"]) < report["loss"][0]

@@ -21,6 +21,7 @@ from jax import lax
 from jaxtyping import Array
 
 from ...images.image import Image
+from ...inverse.checkpoint import Checkpoint
 from ...inverse.fit import fit
 from ...inverse.optimisers import Adam
 from ...inverse.transforms import Positive
@@ -153,7 +154,13 @@ def prepare_constants(image: Image, settings: ConstantsSettings) -> tuple[Consta
 
 
 def fit_constants(
-    image: Image, names: Sequence[str], settings: ConstantsSettings | None = None, on_iteration: Any = None, progress: Any = None
+    image: Image,
+    names: Sequence[str],
+    settings: ConstantsSettings | None = None,
+    on_iteration: Any = None,
+    checkpoint: Checkpoint | None = None,
+    resume: bool = False,
+    progress: Any = None,
 ) -> Reconstructed:
     """Fit some of `NAMES` through the rollout, each kept positive; `result.fit.parameters` has them by name.
 
@@ -164,6 +171,8 @@ def fit_constants(
         names: constants to be fitted.
         settings: see `ConstantsSettings`.
         on_iteration: called after each evaluation, as in `fit`.
+        checkpoint: where and how often to save, as in `fit`.
+        resume: go on from the checkpoint.
         progress: shows a bar.
 
     Raises:
@@ -177,7 +186,7 @@ def fit_constants(
     scene = loss.scene
     start = {name: getattr(loss.others, name) for name in names}
     adam = Adam(settings.learning_rate, decay_over=settings.n_iterations)
-    found = fit(loss, start, adam, settings.n_iterations, on_iteration, carried, Positive(), progress=progress)
+    found = fit(loss, start, adam, settings.n_iterations, on_iteration, carried, Positive(), None, checkpoint, resume, progress)
     mesh = adapted(scene, loss.others.replaced(found.parameters))
     error = SurfaceError(scene)
     law, fitted = measure(error, carried), measure(error, mesh)

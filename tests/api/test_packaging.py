@@ -54,7 +54,7 @@ def test_the_library_asks_for_every_package_it_imports():
     project = PYPROJECT["project"]
     texts = [*project["dependencies"], *(text for extra in project["optional-dependencies"].values() for text in extra)]
     declared = {packaging.requirements.Requirement(text).name for text in texts}
-    imported_as = {"PIL": "pillow"}
+    imported_as = {"PIL": "pillow", "mpl_toolkits": "matplotlib"}
     bare = {name.split(".")[0] for path in source.files() for name, _, _ in source.imports(path)}
     third_party = {imported_as.get(name, name) for name in bare} - source.STANDARD - {"jaxspring"}
     assert sorted(third_party - declared - {"networkx"}) == []  # networkx: only ever the user's own graph

@@ -106,7 +106,9 @@ def picture(lattice_rows: list[dict], graph_rows: list[dict], path: Path) -> Non
     left.set(xlabel="nodes", ylabel="time / bare forward scan", title="cloth, 6 spring families", ylim=(0, None))
     sizes = [row["nodes"] for row in graph_rows]
     for name, style in (("Gather", "o-"), ("Scatter", "s--"), ("autodiff", "^:")):
-        right.semilogx(sizes, [row[f"{name}_over_bare"] for row in graph_rows], style, label=name.replace("autodiff", "autodiff, bare scatter"))
+        right.semilogx(
+            sizes, [row[f"{name}_over_bare"] for row in graph_rows], style, label=name.replace("autodiff", "autodiff, bare scatter")
+        )
     right.set(xlabel="nodes", ylabel="time / bare forward scan", title="Delaunay mesh", ylim=(0, None))
     for axes in (left, right):
         axes.legend(fontsize=8)

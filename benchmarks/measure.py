@@ -12,7 +12,7 @@ import platform
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -86,10 +86,15 @@ def versions() -> dict[str, str]:
     for name in names:
         try:
             found[name] = version(name)
-        except Exception:  # noqa: BLE001 (a package run from its folder has no metadata)
+        except PackageNotFoundError:  # a package run from its folder has no metadata
             found[name] = "not installed"
     device = jax.devices()[0]
-    return {**found, "python": platform.python_version(), "device": f"{device.platform}: {device.device_kind}", "machine": platform.machine()}
+    return {
+        **found,
+        "python": platform.python_version(),
+        "device": f"{device.platform}: {device.device_kind}",
+        "machine": platform.machine(),
+    }
 
 
 def write(name: str, settings: dict[str, Any], tables: dict[str, Any]) -> Path:

@@ -31,14 +31,11 @@ def fall(n_steps, state, adjoint=None):
 
     def loss(k):
         end = js.rollout(cloth(k), state, js.SymplecticEuler(), 2e-3, n_steps, adjoint=adjoint).state
-        return jnp.sum(end.position.dot(end.position))
+        # Of the way gone, not of the place: a large loss would drown differences in rounding.
+        moved = end.position - state.position
+        return jnp.sum(moved.dot(moved))
 
     return loss
-
-
-def temporaries(function, *arguments):
-    """Bytes of temporary memory of the compiled program, by its own analysis."""
-    return jax.jit(function).lower(*arguments).compile().memory_analysis().temp_size_in_bytes
 
 
 @pytest.mark.slow
@@ -56,9 +53,12 @@ def test_d1_long_gradients_in_little_memory(rng):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("n_steps", "step", "bound"), [(100, 1e-4, 1e-4), (100, 1e-2, 1e-7), (1_000, 1e-4, 1e-9), (10_000, 1e-4, 1e-8)])
+@pytest.mark.parametrize(("n_steps", "step", "bound"), [(100, 1e-4, 1e-4), (100, 1e-2, 1e-7), (1_000, 1e-3, 1e-9), (10_000, 1e-4, 1e-8)])
 def test_d2_against_central_differences(rng, n_steps, step, bound):
-    """dL/dk after 100, 1,000 and 10,000 damped steps against central differences (bounds: ten times a trial implementation)."""
+    """dL/dk after 100, 1,000 and 10,000 damped steps against central differences (bounds: of a trial implementation).
+
+    After 1,000 steps h = 1e-3, not 1e-4: the rounding of a thousand steps over 2e-4 is 5e-9 of this gradient, measured.
+    """
     loss = jax.jit(fall(n_steps, start(rng)))
     k = jnp.asarray(100.0)
     gradient = float(jax.grad(loss)(k))

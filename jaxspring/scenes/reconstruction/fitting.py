@@ -47,8 +47,8 @@ class SpringSettings:
     """
 
     nodes: tuple[int, int] = (41, 41)
-    n_iterations: int = 600
-    learning_rate: float = 0.1
+    n_iterations: int = 700
+    learning_rate: float = 0.15
     momentum: float = 0.95
     k_min: float = 1.0
     k_max: float = 30.0

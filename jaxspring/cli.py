@@ -18,6 +18,8 @@ from ._version import __version__
 
 DONE, FAILED, UNUSABLE, INTERRUPTED = 0, 1, 2, 130
 LAW = ("k_min", "k_max", "sigma", "k_data", "drag")
+# As SpringSettings and ConstantsSettings have them; a test compares. Repeated so that `--help` loads no JAX.
+UPDATES_OF_STIFFNESS, UPDATES_OF_CONSTANTS = 700, 100
 PARAMETERS = ("stiffness", "k_pixel", *LAW)
 LARGEST_MESH = 4_000_000  # nodes: beyond, one rollout alone takes minutes
 
@@ -63,7 +65,13 @@ def parse(argv: Sequence[str]) -> Arguments:
     given = _parser().parse_args(argv)
     image = None if given.image is None else pathlib.Path(given.image)
     out = pathlib.Path(given.out or f"jaxspring-{'elevation' if image is None else image.stem or 'image'}")
-    updates = given.iterations if given.iterations is not None else 600 if given.parameters == ("stiffness",) else 100
+    updates = (
+        given.iterations
+        if given.iterations is not None
+        else UPDATES_OF_STIFFNESS
+        if given.parameters == ("stiffness",)
+        else UPDATES_OF_CONSTANTS
+    )
     return Arguments(image, given.nodes, given.parameters, updates, out, given.resume)
 
 
@@ -146,7 +154,10 @@ def _parser() -> argparse.ArgumentParser:
         help=f"what is fitted: stiffness (one per spring, the default), k_pixel, or some of {','.join(LAW)}",
     )
     fit.add_argument(
-        "--iterations", type=iterations, metavar="N", help="updates of the parameters (600 of the stiffness, 100 of other constants)"
+        "--iterations",
+        type=iterations,
+        metavar="N",
+        help=f"updates ({UPDATES_OF_STIFFNESS} of the stiffness, {UPDATES_OF_CONSTANTS} of constants)",
     )
     fit.add_argument("--out", metavar="DIR", help="folder for the results (jaxspring-<image>); an older result there is replaced")
     fit.add_argument("--resume", action="store_true", help="go on from the checkpoint of an interrupted or finished run with the same DIR")

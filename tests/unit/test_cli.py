@@ -255,3 +255,12 @@ def test_the_constants_of_the_slides_mesh_are_fitted(tmp_path, names):
     assert set(before) == set(after) == set(names.split(","))
     assert all(before[name] != after[name] > 0 for name in before)
     assert min(report["loss"]) < report["loss"][0]
+
+
+def test_the_command_makes_as_many_updates_as_the_settings_say():
+    """The defaults that `--help` prints are those of the settings."""
+    from jaxspring.scenes.reconstruction.constants import ConstantsSettings
+    from jaxspring.scenes.reconstruction.fitting import SpringSettings
+
+    assert cli.UPDATES_OF_STIFFNESS == SpringSettings().n_iterations
+    assert cli.UPDATES_OF_CONSTANTS == ConstantsSettings().n_iterations

@@ -262,5 +262,5 @@ def test_the_command_makes_as_many_updates_as_the_settings_say():
     from jaxspring.scenes.reconstruction.constants import ConstantsSettings
     from jaxspring.scenes.reconstruction.fitting import SpringSettings
 
-    assert cli.UPDATES_OF_STIFFNESS == SpringSettings().n_iterations
-    assert cli.UPDATES_OF_CONSTANTS == ConstantsSettings().n_iterations
+    assert SpringSettings().n_iterations == cli.UPDATES_OF_STIFFNESS
+    assert ConstantsSettings().n_iterations == cli.UPDATES_OF_CONSTANTS

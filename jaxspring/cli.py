@@ -65,13 +65,8 @@ def parse(argv: Sequence[str]) -> Arguments:
     given = _parser().parse_args(argv)
     image = None if given.image is None else pathlib.Path(given.image)
     out = pathlib.Path(given.out or f"jaxspring-{'elevation' if image is None else image.stem or 'image'}")
-    updates = (
-        given.iterations
-        if given.iterations is not None
-        else UPDATES_OF_STIFFNESS
-        if given.parameters == ("stiffness",)
-        else UPDATES_OF_CONSTANTS
-    )
+    usual = UPDATES_OF_STIFFNESS if given.parameters == ("stiffness",) else UPDATES_OF_CONSTANTS
+    updates = usual if given.iterations is None else given.iterations
     return Arguments(image, given.nodes, given.parameters, updates, out, given.resume)
 
 

@@ -57,21 +57,12 @@ def replace(
     >>> print(replace(system, stiffness=2.0, mass=3.0).forces[0].stiffness)
     2.0
     """
-    wanted = {
-        "stiffness": stiffness,
-        "rest_length": rest_length,
-        "gamma": gamma,
-        "damping": damping,
-        "acceleration": acceleration,
-        "strength": strength,
-        "k_min": k_min,
-        "k_max": k_max,
-        "sigma": sigma,
-    }
-    wanted = {name: value for name, value in wanted.items() if value is not None}
+    names = ("stiffness", "rest_length", "gamma", "damping", "acceleration", "strength", "k_min", "k_max", "sigma")
+    values = (stiffness, rest_length, gamma, damping, acceleration, strength, k_min, k_max, sigma)
     changes: dict[int, dict[str, Any]] = {}
-    for name, value in wanted.items():
-        changes.setdefault(_find(system, name, effect), {})[name] = value
+    for name, value in zip(names, values, strict=True):
+        if value is not None:
+            changes.setdefault(_find(system, name, effect), {})[name] = value
     forces = tuple(_with(force, changes[i]) if i in changes else force for i, force in enumerate(system.forces))
     new_mass = system.mass if mass is None else System(system.net, mass).mass
     return eqx.tree_at(lambda s: (s.forces, s.mass), system, (forces, new_mass))

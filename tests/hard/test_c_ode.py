@@ -8,6 +8,8 @@ import pytest
 import jaxspring as js
 from jaxspring.ode import diffeqsolve
 
+pytestmark = pytest.mark.slow  # diffrax compiles for seconds
+
 
 def scene(load=None):
     net = js.lattice(2)

@@ -55,15 +55,19 @@ _HOMES = {
     "steppers.base": ("Stepper",),
     "steppers.explicit": ("ForwardEuler", "RungeKutta4", "SymplecticEuler", "VelocityVerlet"),
     "steppers.stability": ("stable_dt",),
-    "inverse.fit": ("Fit", "fit"),
+    "inverse.fit": ("Fit", "History", "Iteration", "fit"),
     "inverse.iteration": ("GradientWarning",),
     "inverse.optimisers": ("LBFGS", "Adam", "LeastSquares", "Optax", "Optimiser"),
     "inverse.stopping": ("Stop", "StopReason"),
     "inverse.transforms": ("Bounded", "Identity", "Positive", "SoftPositive", "Transform"),
-    "inverse.select": ("select",),
+    "inverse.select": ("Selection", "select"),
     "inverse.losses": ("squared_distance",),
     "inverse.checkpoint": ("Checkpoint",),
     "inverse.check": ("GradientCheck", "check_gradient"),
+    "scenes.reconstruction.scene": ("Reconstruction", "Relaxation"),
+    "scenes.reconstruction.pixels": ("PixelSprings",),
+    "scenes.reconstruction.fitting": ("Reconstructed", "SpringSettings", "fit_springs"),
+    "scenes.reconstruction.constants": ("ConstantsSettings", "fit_constants"),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 

@@ -17,7 +17,7 @@ _HOMES = {
     "system": ("Energy", "Motion", "System", "lumped_mass"),
     "edit": ("replace",),
     "rollouts": ("Result", "Resume", "rollout"),
-    "ode": ("OdeResult", "diffeqsolve"),
+    "ode": ("OdeInfo", "OdeResult", "diffeqsolve"),
     "blocks": ("Checkpointed", "StoreAll"),
     "progress": ("Progress",),
     "files": ("load", "save", "save_trajectory"),

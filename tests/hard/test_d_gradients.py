@@ -114,7 +114,7 @@ def test_d7_at_rest():
 STEPPERS = [js.ForwardEuler(), js.SymplecticEuler(), js.VelocityVerlet(), js.RungeKutta4()]
 
 
-# Both precisions for the slides' stepper, every topology in float64.
+# Every stepper on every topology in float64; float32 once on each topology.
 CASES = [(stepper, kind, "float64") for stepper in STEPPERS for kind in ("lattice", "gather", "scatter")]
 CASES += [
     (js.SymplecticEuler(), "lattice", "float32"),

@@ -247,9 +247,7 @@ class _Run:
 
     def _next(self, report: Report) -> Snapshot:
         done = len(self.history["loss"])
-        return Snapshot(
-            report.after, self.best, report.memory, report.carried, self.best_carried, done, self.best_iteration, self.history
-        )
+        return Snapshot(report.after, self.best, report.memory, report.carried, self.best_carried, done, self.best_iteration, self.history)
 
     def _save(self) -> None:
         """Write what the next iteration starts from; an evaluation that was not followed by an update is done again on resuming."""

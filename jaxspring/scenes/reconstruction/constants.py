@@ -44,6 +44,8 @@ NAMES = ("k_min", "k_max", "sigma", "k_data", "drag", "k_pixel")
 K_HEIGHT = 0.05
 # Mass over the sum of the stiffnesses: room for a stiffness that grows during the rollout, and from one iteration to the next.
 HEAVIER = 1.5
+# Rollouts before the first iteration, in which nothing is fitted.
+SETTLING_RUNS = 5
 
 
 class Constants(eqx.Module):
@@ -146,11 +148,17 @@ class ConstantsSettings:
 
 
 def prepare_constants(image: Image, settings: ConstantsSettings) -> tuple[ConstantsLoss, Carried]:
-    """The loss with the usual constants, and what its first evaluation starts from: the mesh of the law, at rest."""
+    """The loss with the usual constants, and what its first evaluation starts from: the law's mesh, its heights settled as well.
+
+    Else the mesh would still be moving by itself in the first iterations, and the loss with it.
+    """
     scene = Reconstruction(image, settings.nodes)
     usual = Constants.usual(scene)
     loss = ConstantsLoss(scene, usual, scene.smoothing_radius(settings.largest_sigma * float(usual.sigma)))
-    return loss, adapted(scene, usual)
+    carried, settle = adapted(scene, usual), eqx.filter_jit(loss)
+    for _ in range(SETTLING_RUNS):
+        _, (carried, _) = settle({}, carried)
+    return loss, carried
 
 
 def fit_constants(
@@ -189,7 +197,7 @@ def fit_constants(
     found = fit(loss, start, adam, settings.n_iterations, on_iteration, carried, Positive(), None, checkpoint, resume, progress)
     mesh = adapted(scene, loss.others.replaced(found.parameters))
     error = SurfaceError(scene)
-    law, fitted = measure(error, carried), measure(error, mesh)
+    law, fitted = measure(error, adapted(scene, loss.others)), measure(error, mesh)
     uniform, _, _ = uniform_errors(scene)
     return Reconstructed(scene, uniform, law, fitted, carried.mass_of, mesh.mass_of, mesh, found, found.status)
 

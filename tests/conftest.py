@@ -6,9 +6,6 @@ Strict is stricter than what a user has. A test that must see JAX as users run i
 import os
 import signal
 
-# A job started in the background may ignore Ctrl-C; the tests of interrupted runs, and the processes they start, must not.
-signal.signal(signal.SIGINT, signal.default_int_handler)
-
 # Before NumPy is imported: on few cores the threads of OpenBLAS cost more than they bring (a 300 x 300 Cholesky took 235 ms).
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # No figure may open a window.
@@ -18,6 +15,9 @@ import hypothesis
 import jax
 import numpy as np
 import pytest
+
+# A job started in the background may ignore Ctrl-C; the tests of interrupted runs, and the processes they start, must not.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")

@@ -6,8 +6,9 @@ run over n + |o| places, so that every node finds "its" spring both as tail and 
     d = x[t + o] - x[t]                 x padded with |o| zeros on both sides, and d masked to zero where a spring does not exist
     f[i] = p[i] - p[i - o]              no padding, no branch in the inner loop
 
-Keeping only the springs that exist would pad every pull back on the nodes, and XLA's padded loops are not vectorised: this form is
-1.5 times faster forward and 2 times faster in the gradient. On a periodic axis nothing is extended; the slice is a roll.
+Keeping only the springs that exist would pad every pull back on the nodes, and XLA's padded loops vectorise badly: on one
+core this form is the faster, on two the gain is smaller (`docs/benchmarks.md`). On a periodic axis nothing is extended; the slice is
+a roll.
 """
 
 from __future__ import annotations

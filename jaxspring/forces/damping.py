@@ -106,6 +106,4 @@ class Dashpots(Force):
         return any_refused(self.damping)
 
     def _rate(self, state: State) -> EdgeField:
-        # A velocity is a difference of neighbouring images: it is never wrapped by a period.
-        unboxed = eqx.tree_at(lambda n: n.box, self.net, None, is_leaf=lambda leaf: leaf is None)
-        return unboxed.difference(state.velocity)
+        return self.net.unboxed().difference(state.velocity)

@@ -89,6 +89,10 @@ class Topology(eqx.Module):
     def flatten(self, field: EdgeField) -> Array:
         """Edge field -> (E,) array in the user's order."""
 
+    @abc.abstractmethod
+    def unboxed(self) -> Topology:
+        """The same springs without periods: a velocity is a difference of neighbouring images, and is never wrapped."""
+
     @property
     def layout(self) -> NodeLayout:
         """How node fields are stored; a `State` keeps it to give points back in the user's order."""

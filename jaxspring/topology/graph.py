@@ -113,6 +113,10 @@ class Graph(Topology):
         inner = np.stack([np.asarray(self.tails), np.asarray(self.heads)], axis=-1)
         return self.nodes.order[inner][self.springs.inverse]
 
+    def unboxed(self) -> Graph:
+        """The same springs without periods."""
+        return eqx.tree_at(lambda net: net.box, self, None, is_leaf=lambda leaf: leaf is None)
+
     def difference(self, x: Vector) -> EdgeField:
         """Head minus tail along each spring."""
         d = self._per_array(self.reduction.difference, x)

@@ -119,6 +119,10 @@ class Lattice(Topology):
             pairs.append(np.stack([numbers[tails].ravel(), heads[tails].ravel()], axis=-1))
         return np.concatenate(pairs).astype(np.int32) if pairs else np.zeros((0, 2), np.int32)
 
+    def unboxed(self) -> Lattice:
+        """The same springs without periods."""
+        return eqx.tree_at(lambda net: net.box, self, None, is_leaf=lambda leaf: leaf is None)
+
     def difference(self, x: Vector) -> EdgeField:
         """Head minus tail along each spring, by shifted slices."""
         forward = partial(_difference, self.grid_shape)

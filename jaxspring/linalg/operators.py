@@ -1,0 +1,250 @@
+"""The matrices of implicit steps, applied without assembling anything: `SpringMatrix`.
+
+    A = diag(c) + sum over nodes of s g g' + sum over springs of D' B D,        B = w I + s u u'
+
+`D` takes differences along springs, `u` is a spring's direction, `g` a node's. `M/dt + G + dt K` has this form: a spring gives its
+weight w and slope s (see `forces/laws.py`), a dashpot a slope alone, masses and drag a diagonal. A coordinate that is held has an
+identity row and column: a product and a solve leave it alone, exactly.
+
+Source: slide "Implicit Solution"; blocks as in Baraff and Witkin (1998), section 4.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+from ..topology.base import NodeLayout, Topology
+from ..topology.edge_field import EdgeField
+from ..vector import Vector
+
+
+class SpringBlocks(eqx.Module):
+    """One symmetric block w I + s u u' per spring of a network.
+
+    Attributes:
+        net: whose springs they are.
+        weight: w, an edge field.
+        slope: s, an edge field, or None where it is zero everywhere (the coordinates then decouple).
+        direction: u, an edge field of `Vector`, or None with `slope`.
+        axes: the coordinates the springs act in; None is all.
+    """
+
+    net: Topology
+    weight: EdgeField
+    slope: EdgeField | None
+    direction: EdgeField | None
+    axes: tuple[int, ...] | None = eqx.field(static=True, default=None)
+
+    def product(self, v: Vector) -> Vector:
+        """D' B D v."""
+        moving = v if self.axes is None else Vector(tuple(v[a] for a in self.axes))
+        d = self.net.unboxed().difference(moving)
+        if self.slope is None or self.direction is None:
+            pulls = self.net.map_springs(lambda d, w: w * d, d, self.weight)
+        else:
+            pulls = self.net.map_springs(_block_product, d, self.weight, self.slope, self.direction)
+        total = -self.net.accumulate(pulls)
+        return total if self.axes is None else _embedded(total, self.axes, v)
+
+    def entry(self, i: int, j: int) -> EdgeField | None:
+        """Entry (i, j) of every spring's block; None where it is zero everywhere."""
+        if self.axes is not None:
+            if i not in self.axes or j not in self.axes:
+                return None
+            i, j = self.axes.index(i), self.axes.index(j)
+        if self.slope is None or self.direction is None:
+            return self.weight if i == j else None
+        along = self.net.map_springs(lambda s, u: s * u[i] * u[j], self.slope, self.direction)
+        return self.weight + along if i == j else along
+
+    def scaled(self, factor: Any) -> SpringBlocks:
+        """The same springs with every block times `factor`."""
+        slope = None if self.slope is None else self.slope * factor
+        return SpringBlocks(self.net, self.weight * factor, slope, self.direction, self.axes)
+
+
+class NodeDyads(eqx.Module):
+    """A block s g g' at every node.
+
+    Attributes:
+        slope: s, node shape.
+        direction: g, `Vector` in node shape.
+    """
+
+    slope: Array
+    direction: Vector
+
+    def product(self, v: Vector) -> Vector:
+        """S g (g . v)."""
+        return (self.slope * self.direction.dot(v)) * self.direction
+
+    def scaled(self, factor: Any) -> NodeDyads:
+        """Every block times `factor`."""
+        return NodeDyads(self.slope * factor, self.direction)
+
+
+class Blocks(eqx.Module):
+    """A sum of node and spring blocks: what a force adds to a matrix.
+
+    Attributes:
+        diagonal: tuple of `Vector`s in node shape (or of a 0-d array per coordinate), added on the diagonal.
+        dyads: blocks of nodes.
+        springs: blocks of springs.
+    """
+
+    diagonal: tuple[Vector, ...] = ()
+    dyads: tuple[NodeDyads, ...] = ()
+    springs: tuple[SpringBlocks, ...] = ()
+
+    def __add__(self, other: Blocks) -> Blocks:
+        return Blocks(self.diagonal + other.diagonal, self.dyads + other.dyads, self.springs + other.springs)
+
+    def scaled(self, factor: Any) -> Blocks:
+        """Every block times `factor`."""
+        return Blocks(
+            tuple(factor * d for d in self.diagonal),
+            tuple(d.scaled(factor) for d in self.dyads),
+            tuple(s.scaled(factor) for s in self.springs),
+        )
+
+    def product(self, v: Vector) -> Vector:
+        """The product with a `Vector` in node shape, no coordinate held."""
+        total = Vector.zeros_like(v)
+        for d in self.diagonal:
+            total = total + Vector(tuple(c * a for c, a in zip(d, v, strict=True)))
+        for term in (*self.dyads, *self.springs):
+            total = total + term.product(v)
+        return total
+
+
+class SpringMatrix(eqx.Module):
+    """A symmetric matrix over the coordinates of all nodes: `Blocks`, with identity rows where a coordinate is held.
+
+    Call it to multiply: `A(v)` with a `Vector` in node shape.
+
+    Attributes:
+        blocks: what is summed.
+        free: per coordinate, a bool array in node shape (None: all free).
+        like: a `Vector` in node shape that tells shape, dimension and dtype.
+        layout: how node fields are stored (static).
+    """
+
+    blocks: Blocks
+    free: tuple[Array | None, ...]
+    like: Vector
+    layout: NodeLayout = eqx.field(static=True)
+
+    @property
+    def dim(self) -> int:
+        """Number of coordinates D."""
+        return self.like.dim
+
+    @property
+    def is_scalar(self) -> bool:
+        """Whether the coordinates decouple by construction: no spring or node block has an entry off its diagonal."""
+        return not self.blocks.dyads and all(term.slope is None for term in self.blocks.springs)
+
+    def __call__(self, v: Vector) -> Vector:
+        """A v; held coordinates of `v` pass through."""
+        return self.pick(self.blocks.product(self.pick(v, Vector.zeros_like(v))), v)
+
+    def pick(self, where_free: Vector, where_held: Vector) -> Vector:
+        """The first where a coordinate is free, the second where it is held."""
+        entries = zip(self.free, where_free, where_held, strict=True)
+        return Vector(tuple(a if mask is None else jnp.where(mask, a, b) for mask, a, b in entries))
+
+    def entry(self, i: int, j: int) -> Array:
+        """Entry (i, j) of every node's own D x D block, in node shape."""
+        shape, dtype = self.like.shape, self.like.dtype
+        total = jnp.zeros(shape, dtype)
+        if i == j:
+            for d in self.blocks.diagonal:
+                total = total + d[i]
+        for dyad in self.blocks.dyads:
+            total = total + dyad.slope * dyad.direction[i] * dyad.direction[j]
+        for term in self.blocks.springs:
+            found = term.entry(i, j)
+            if found is not None and term.net.n_springs:
+                total = total + term.net.incident_sum(found)
+        for mask in {id(m): m for m in (self.free[i], self.free[j]) if m is not None}.values():
+            total = jnp.where(mask, total, jnp.full((), float(i == j), dtype))
+        return total
+
+    def diagonal(self) -> Vector:
+        """The diagonal; 1 where held."""
+        return Vector(tuple(self.entry(i, i) for i in range(self.dim)))
+
+    def node_blocks(self) -> tuple[Vector, ...]:
+        """Rows of every node's own D x D block: `node_blocks()[i][j]` is a node array."""
+        upper = {(i, j): self.entry(i, j) for i in range(self.dim) for j in range(i, self.dim)}
+        return tuple(Vector(tuple(upper[min(i, j), max(i, j)] for j in range(self.dim))) for i in range(self.dim))
+
+    def to_dense(self) -> Array:
+        """(N D, N D) array, rows by node in the user's order and then by coordinate. For small systems."""
+        layout, n, dim = self.layout, int(np.prod(self.like.shape)), self.dim
+        flat = jnp.eye(n * dim, dtype=self.like.dtype).reshape(n * dim, n, dim)
+
+        def column(points: Array) -> Array:
+            v = Vector(tuple(layout.unflatten(points[:, i]) for i in range(dim)))
+            return jnp.stack([layout.flatten(a) for a in self(v)], axis=-1).ravel()
+
+        return lax.map(column, flat).T
+
+    def to_scipy(self) -> Any:
+        """`scipy.sparse.csr_array` in the order of `to_dense`. On the host: not for traced values."""
+        from scipy.sparse import coo_array
+
+        layout, n, dim = self.layout, int(np.prod(self.like.shape)), self.dim
+        free = np.ones((n, dim), bool)
+        for i, mask in enumerate(self.free):
+            if mask is not None:
+                free[:, i] = np.asarray(layout.flatten(jnp.broadcast_to(mask, self.like.shape)))
+        rows, columns, values = [], [], []
+
+        def add(row: Any, column: Any, i: int, j: int, value: Any) -> None:
+            keep = free[row, i] & free[column, j]
+            rows.append((row * dim + i)[keep])
+            columns.append((column * dim + j)[keep])
+            values.append(np.asarray(value)[keep])
+
+        nodes = np.arange(n)
+        for i in range(dim):
+            for j in range(dim):
+                # Held rows have the entry 1 here, and no other.
+                value = np.asarray(layout.flatten(self.entry(i, j)))
+                rows.append(nodes * dim + i)
+                columns.append(nodes * dim + j)
+                values.append(value)
+                for term in self.blocks.springs:
+                    found = term.entry(i, j)
+                    if found is not None and term.net.n_springs:
+                        tail, head = term.net.edges[:, 0], term.net.edges[:, 1]
+                        off = -np.asarray(term.net.flatten(found))
+                        add(tail, head, i, j, off)
+                        add(head, tail, i, j, off)
+        size = (n * dim, n * dim)
+        matrix = coo_array((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=size).tocsr()
+        matrix.eliminate_zeros()
+        return matrix
+
+
+def isotropic(value: Any, like: Vector) -> Vector:
+    """A node array (or number) on the diagonal of every coordinate, in node shape."""
+    return like.map(lambda a: jnp.broadcast_to(jnp.asarray(value, a.dtype), a.shape))
+
+
+def _block_product(d: Vector, weight: Array, slope: Array, u: Vector) -> Vector:
+    return weight * d + (slope * u.dot(d)) * u
+
+
+def _embedded(total: Vector, axes: tuple[int, ...], like: Vector) -> Vector:
+    return Vector(tuple(total[axes.index(i)] if i in axes else jnp.zeros_like(a) for i, a in enumerate(like)))
+
+
+__all__ = ["Blocks", "NodeDyads", "SpringBlocks", "SpringMatrix", "isotropic"]

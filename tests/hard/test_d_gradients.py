@@ -8,6 +8,7 @@ import pytest
 
 import jaxspring as js
 from jaxspring.images import CubicSpline, Image
+from jaxspring.status import Flag
 from tests.reference import central_difference, relative_error
 
 SHEET = js.lattice((10, 10), js.STRUCTURAL + js.SHEAR)
@@ -84,6 +85,41 @@ def test_d5_chaos_has_large_gradients_never_zeros(rng):
     assert 10 < norms[0] < 1e-6 * norms[1]
     assert norms[2] > np.finfo(np.float32).max
     assert not np.isfinite(gradient("float32", 1500)).any()
+
+
+def squeezed(n_steps):
+    """Sum of the sideways positions of a chain squeezed to half its length, exactly on its axis: an equilibrium from which any push to
+    the side grows by about e in each step. The sum stays zero, and its derivative by the start does not.
+    """
+    net = js.lattice(8)
+    free = np.ones(8, bool)
+    free[[0, 7]] = False
+    k, l, dt = (np.float32(c) for c in (1.0, 1.0, 0.5))
+
+    def loss(points):
+        system = js.System(net, np.float32(1), js.Springs(net, k, l), free=free)
+        start = js.State.from_points(net, points.astype(jnp.float32))
+        return jnp.sum(js.rollout(system, start, js.SymplecticEuler(), dt, n_steps).state.position.y)
+
+    return loss, jnp.asarray(np.c_[0.5 * np.arange(8), np.zeros(8)], jnp.float32)
+
+
+@pytest.mark.slow
+def test_d5_an_overflow_is_reported():
+    """A gradient beyond the range of float32 makes `fit` and `check_gradient` say NONFINITE and train nothing; one within it does not."""
+    loss, points = squeezed(20)
+    assert js.check_gradient(loss, points).status.is_ok
+    loss, points = squeezed(400)
+    found = js.fit(loss, points, js.Adam(0.1), n_iterations=5)
+    assert found.status.has(Flag.NONFINITE)
+    assert found.reason is js.StopReason.FAILED
+    assert found.history.loss.tolist() == [0]
+    assert not np.isfinite(found.history.gradient_norm).any()
+    np.testing.assert_array_equal(found.parameters, points)
+    checked = js.check_gradient(loss, points)
+    assert checked.status.has(Flag.NONFINITE)
+    assert not np.isfinite(checked.leaves[0].gradient)
+    assert not np.isfinite(checked.error)
 
 
 def test_d7_at_rest():

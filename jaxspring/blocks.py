@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from .state import State
+from .linalg.implicit import SOLUTION
 from .watch import Carry, Watch
 
 Pair = tuple[Carry, Watch]
@@ -34,8 +34,17 @@ class Checkpointed(eqx.Module):
     block: int | None = eqx.field(static=True, default=None)
 
 
+class StoreStates(eqx.Module):
+    """Reverse mode that stores the state and the solution of every step and computes the rest of a step again: O(T) memory, no second
+    solve. For implicit steps.
+    """
+
+
 class StoreAll(eqx.Module):
-    """Reverse mode that stores every state: O(T) memory, no second forward run."""
+    """Reverse mode that stores everything every step computes: O(T) memory, no second forward run."""
+
+
+Adjoint = Checkpointed | StoreStates | StoreAll
 
 
 @dataclass(frozen=True)
@@ -47,7 +56,8 @@ class Plan:
         save_every: steps s in a frame, or None for no frames.
         block: steps b in a block (few frames).
         group: frames g in a block (many frames), or 0.
-        rematerialise: whether reverse mode runs blocks again instead of storing their states.
+        steps_again: whether reverse mode runs a step again, but for its solve, instead of storing all it computed.
+        blocks_again: whether it runs blocks again instead of storing their states.
         check_every: look for trouble every so many steps; None is once per block.
     """
 
@@ -55,7 +65,8 @@ class Plan:
     save_every: int | None
     block: int
     group: int
-    rematerialise: bool
+    steps_again: bool
+    blocks_again: bool
     check_every: int | None
 
     @property
@@ -76,22 +87,22 @@ class Plan:
         return [replace(self, n_steps=n) for n in lengths + [rest] * bool(rest)]
 
 
-def make_plan(n_steps: int, save_every: int | None, adjoint: Checkpointed | StoreAll, check_every: int | None) -> Plan:
+def make_plan(n_steps: int, save_every: int | None, adjoint: Adjoint, check_every: int | None) -> Plan:
     """Cut a run of `n_steps`, frames after every `save_every`."""
-    remat = isinstance(adjoint, Checkpointed)
+    remat = (not isinstance(adjoint, StoreAll), isinstance(adjoint, Checkpointed))
     wanted = adjoint.block if isinstance(adjoint, Checkpointed) and adjoint.block else max(round(math.sqrt(n_steps)), 1)
     if save_every is None:
-        return Plan(n_steps, None, _near_divisor(n_steps, wanted), 0, remat, check_every)
+        return Plan(n_steps, None, _near_divisor(n_steps, wanted), 0, *remat, check_every)
     if save_every >= wanted:
-        return Plan(n_steps, save_every, _near_divisor(save_every, wanted), 0, remat, check_every)
+        return Plan(n_steps, save_every, _near_divisor(save_every, wanted), 0, *remat, check_every)
     group = _near_divisor(n_steps // save_every, max(round(wanted / save_every), 1))
-    return Plan(n_steps, save_every, save_every, group, remat, check_every)
+    return Plan(n_steps, save_every, save_every, group, *remat, check_every)
 
 
 def run_blocks(
     advance: Callable[[Carry], Carry],
     inspect: Callable[[Carry, Carry, Watch], Watch],
-    keep: Callable[[State], Any],
+    keep: Callable[[Carry], Any],
     report: Callable[[Carry], None],
     pair: Pair,
     plan: Plan,
@@ -126,7 +137,7 @@ def run_blocks(
 
         def frame(pair: Pair, _: None) -> tuple[Pair, Any]:
             pair = stretch(pair, every)
-            return pair, keep(pair[0].state)
+            return pair, keep(pair[0])
 
         return lax.scan(frame, pair, None, length=n_frames)
 
@@ -134,7 +145,7 @@ def run_blocks(
         def frames(pair: Pair) -> tuple[Pair, Any]:
             def frame(pair: Pair, _: None) -> tuple[Pair, Any]:
                 pair = steps(pair, every)
-                return pair, keep(pair[0].state)
+                return pair, keep(pair[0])
 
             return lax.scan(frame, pair, None, length=n)
 
@@ -161,7 +172,9 @@ def _stepping(
             watch = lax.cond(due, lambda w: inspect(before, after, w), lambda w: w, watch)
         return (after, watch), None
 
-    step = jax.checkpoint(one, prevent_cse=False) if plan.rematerialise else one
+    # What a solve found is kept: the backward pass then solves once per step, for its own right-hand side.
+    keep = jax.checkpoint_policies.save_only_these_names(SOLUTION)
+    step = jax.checkpoint(one, prevent_cse=False, policy=keep) if plan.steps_again else one
 
     def steps(pair: Pair, n: int) -> Pair:
         if n == 1:
@@ -176,7 +189,7 @@ def _stepping(
 
 
 def _remat(function: Callable[[Pair], Any], plan: Plan) -> Callable[[Pair], Any]:
-    return jax.checkpoint(function, prevent_cse=False) if plan.rematerialise else function
+    return jax.checkpoint(function, prevent_cse=False) if plan.blocks_again else function
 
 
 def _near_divisor(n: int, wanted: int) -> int:

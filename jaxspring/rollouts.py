@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -21,7 +22,8 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from ._checks import finite, is_concrete
-from .blocks import Checkpointed, Plan, StoreAll, make_plan, run_blocks
+from .blocks import Adjoint, Checkpointed, Plan, make_plan, run_blocks
+from .linalg.base import SolveInfo
 from .numerics import is_traced, stopped
 from .progress import LONG_RUN, N_CHUNKS, Progress
 from .state import State
@@ -29,7 +31,7 @@ from .status import EXPLANATION, Flag, StabilityWarning, Status
 from .steppers.base import Stepper
 from .steppers.stability import dt_limit
 from .system import System
-from .watch import Carry, begin, inspect, settle
+from .watch import Carry, Solves, begin, inspect, settle
 
 
 class Info(eqx.Module):
@@ -38,10 +40,14 @@ class Info(eqx.Module):
     Attributes:
         stable_dt: largest dt [s] that is surely stable at the start; None where the stepper does not know.
         n_steps: steps that were done.
+        solves: the solves of implicit steps summed up (iterations, largest residual, status); None for an explicit stepper.
+        solves_saved: with `keep_solves`, the last solve before each frame, stacked on a leading axis (of every step if save_every=1).
     """
 
     stable_dt: Array | None
     n_steps: Array
+    solves: Solves | None = None
+    solves_saved: SolveInfo | None = None
 
 
 class Resume(eqx.Module):
@@ -50,6 +56,22 @@ class Resume(eqx.Module):
     start_time: Array
     step: Array
     memory: Any
+
+
+class _Job(eqx.Module):
+    """How a run is done: the arguments of `rollout` besides system and state."""
+
+    stepper: Stepper
+    dt: Array
+    resume: Resume
+    observe: Callable[[State], Any] | None
+    plan: Plan = eqx.field(static=True)
+    keep_solves: bool = eqx.field(static=True)
+
+    def keep(self, carry: Carry) -> tuple[Any, SolveInfo | None]:
+        """What a frame holds."""
+        frame = carry.state if self.observe is None else self.observe(carry.state)
+        return frame, None if carry.solves is None or not self.keep_solves else carry.solves.last
 
 
 class Result(eqx.Module):
@@ -80,10 +102,11 @@ def rollout(
     n_steps: int,
     save_every: int | None = None,
     observe: Callable[[State], Any] | None = None,
-    adjoint: Checkpointed | StoreAll | None = None,
+    adjoint: Adjoint | None = None,
     progress: Progress | None = None,
     check_every: int | None = None,
     resume: Resume | None = None,
+    keep_solves: bool = False,
 ) -> Result:
     """Advance a state by `n_steps` steps of `dt`.
 
@@ -95,10 +118,11 @@ def rollout(
         n_steps: number of steps (static).
         save_every: keep a frame after every so many steps; must divide `n_steps`. None keeps none.
         observe: what to keep of a state in each frame; None keeps the whole state. A new lambda at every call compiles anew.
-        adjoint: how reverse mode remembers; `Checkpointed()` unless said.
+        adjoint: how reverse mode remembers; `Checkpointed()` unless said, or `StoreStates()`, `StoreAll()`.
         progress: a `Progress` shows a bar and may call the host between chunks of steps.
         check_every: look for trouble every so many steps instead of once per block.
         resume: the `resume` of an earlier result, to go on as if unbroken.
+        keep_solves: keep in each frame how the last solve of an implicit stepper ended, in `info.solves_saved`.
 
     Returns:
         A `Result`. Trouble is in its status, never an exception: call `raise_for_status(result)`. An eager call that is interrupted
@@ -120,9 +144,10 @@ def rollout(
     dt = jnp.asarray(dt, state.dtype)
     plan = make_plan(n_steps, save_every, Checkpointed() if adjoint is None else adjoint, check_every)
     resume = Resume(state.time, jnp.zeros((), jnp.int32), _Unset()) if resume is None else resume
-    if is_traced(system, state, dt, resume):
-        return _compiled(system, state, stepper, dt, plan, observe, resume, progress)
-    result = _run_eagerly(system, state, stepper, dt, plan, observe, resume, progress)
+    job = _Job(stepper, dt, resume, observe, plan, keep_solves)
+    if is_traced(system, state, job):
+        return _compiled(system, state, job, progress)
+    result = _run_eagerly(system, state, job, progress)
     if result.info.stable_dt is not None and bool(result.status.has(Flag.DT_LIMIT)):
         text = f"dt = {float(dt):.6g} s, but this run is surely stable only up to {float(result.info.stable_dt):.6g} s"
         warnings.warn(f"DT_LIMIT: {EXPLANATION[Flag.DT_LIMIT]}: {text}.", StabilityWarning, stacklevel=2)
@@ -131,41 +156,41 @@ def rollout(
     return result
 
 
-def _run(
-    system: System,
-    state: State,
-    stepper: Stepper,
-    dt: Array,
-    plan: Plan,
-    observe: Callable[[State], Any] | None,
-    resume: Resume,
-    progress: Progress | None = None,
-) -> Result:
+def _run(system: System, state: State, job: _Job, progress: Progress | None = None) -> Result:
     """The whole run as one traced program."""
     ready = system.prepare(state.dtype)
     start = ready.constrain(state)
     still, still_start = stopped((ready, start))
-    limit = dt_limit(still, still_start, stepper)
-    memory = stepper.init(ready, start) if isinstance(resume.memory, _Unset) else resume.memory
-    carry = Carry(start, memory, resume.step)
+    limit = dt_limit(still, still_start, job.stepper)
+    memory = job.stepper.init(ready, start) if isinstance(job.resume.memory, _Unset) else job.resume.memory
+    info = job.stepper.report(memory)
+    if job.keep_solves and (info is None or job.plan.save_every is None):
+        raise ValueError("keep_solves keeps how an implicit stepper's solves ended in each frame: pass save_every and an implicit stepper.")
+    carry = Carry(start, memory, job.resume.step, None if info is None else Solves.none(info))
 
-    advance = partial(_advance, ready, stepper, dt, resume.start_time)
+    advance = partial(_advance, ready, job.stepper, job.dt, job.resume.start_time)
 
     def report(carry: Carry) -> None:
         if progress is not None:
-            jax.debug.callback(partial(progress.update, total=plan.n_steps), carry.step)
+            jax.debug.callback(partial(progress.update, total=job.plan.n_steps), carry.step)
 
-    watch = begin(system, ready, carry, dt, limit)
-    keep = _whole_state if observe is None else observe
-    (carry, watch), saved = run_blocks(advance, partial(inspect, ready), keep, report, (carry, watch), plan)
-    # The replay of a failed block is not part of what is differentiated.
-    still_dt, still_time = stopped((dt, resume.start_time))
+    watch = begin(system, ready, carry, job.dt, limit)
+    (carry, watch), frames = run_blocks(advance, partial(inspect, ready), job.keep, report, (carry, watch), job.plan)
+    saved, solves_saved = (None, None) if frames is None else frames
+    if carry.solves is None:
+        # The replay of a failed block is not part of what is differentiated.
+        still_dt, still_time = stopped((job.dt, job.resume.start_time))
+        status = settle(partial(_advance, still, job.stepper, still_dt, still_time), watch, still)
+    else:
+        # An implicit step looks at itself, so that nothing need be replayed. What was wrong before the first step comes first.
+        at_start = watch.status.step == 0
+        status = watch.status.only_if(at_start).then(carry.solves.status).then(watch.status.only_if(~at_start))
     return Result(
         state=carry.state,
         saved=saved,
-        status=_in_user_order(settle(partial(_advance, still, stepper, still_dt, still_time), watch, still), state),
-        info=Info(limit, carry.step),
-        resume=Resume(resume.start_time, carry.step, carry.memory),
+        status=_in_user_order(status, state),
+        info=Info(limit, carry.step, carry.solves, solves_saved),
+        resume=Resume(job.resume.start_time, carry.step, carry.memory),
         effects=tuple(type(f).__name__ for f in system.forces),
     )
 
@@ -183,59 +208,52 @@ def _advance(system: System, stepper: Stepper, dt: Array, start_time: Array, car
     index = carry.step + 1
     state, memory = stepper.step(system, carry.state, dt, carry.memory)
     state = eqx.tree_at(lambda s: s.time, state, start_time + index.astype(dt.dtype) * dt)
-    return Carry(state if system.motion is None else system.constrain(state), memory, index)
+    info = stopped(stepper.report(memory))
+    solves = carry.solves if carry.solves is None or info is None else carry.solves.then(info, index)
+    return Carry(state if system.motion is None else system.constrain(state), memory, index, solves)
 
 
 _compiled = eqx.filter_jit(_run)
 
 
-def _run_eagerly(
-    system: System,
-    state: State,
-    stepper: Stepper,
-    dt: Array,
-    plan: Plan,
-    observe: Callable[[State], Any] | None,
-    resume: Resume,
-    progress: Progress | None,
-) -> Result:
+def _run_eagerly(system: System, state: State, job: _Job, progress: Progress | None) -> Result:
     """The run in chunks, with the host between them where somebody watches or the run is long."""
+    plan = job.plan
     is_long = progress is not None or plan.n_steps * math.prod(state.position.shape) > LONG_RUN
     pieces = plan.pieces(N_CHUNKS) if is_long else [plan]
     result: Any = None
-    frames, done = [], 0
+    frames, resume, done = [], job.resume, 0
     try:
         for piece in pieces:
-            latest = _compiled(system, state, stepper, dt, piece, observe, resume)
+            latest = _compiled(system, state, _Job(job.stepper, job.dt, resume, job.observe, piece, job.keep_solves))
             if len(pieces) > 1 or progress is not None:
                 jax.block_until_ready(latest)
             if result is not None:
                 latest = eqx.tree_at(lambda r: (r.status, r.info), latest, (result.status.then(latest.status), _joined(result, latest)))
             result, state, resume, done = latest, latest.state, latest.resume, done + piece.n_steps
-            frames.append(latest.saved)
+            frames.append((latest.saved, latest.info.solves_saved))
             if progress is not None:
                 progress.update(done, plan.n_steps)
     except KeyboardInterrupt:
         if result is None:
             raise
-        stopped = Status.when(Flag.INTERRUPTED, True, step=resume.step)
-        result = eqx.tree_at(lambda r: r.status, result, result.status.then(stopped))
+        stopped_here = Status.when(Flag.INTERRUPTED, True, step=resume.step)
+        result = eqx.tree_at(lambda r: r.status, result, result.status.then(stopped_here))
     if len(frames) > 1 and plan.save_every is not None:
         saved = jax.tree.map(lambda *parts: jnp.concatenate(parts), *frames)
-        result = eqx.tree_at(lambda r: r.saved, result, saved)
+        result = Result(result.state, saved[0], result.status, replace(result.info, solves_saved=saved[1]), result.resume, result.effects)
     return result
 
 
 def _joined(first: Result, latest: Result) -> Info:
-    return Info(first.info.stable_dt, latest.info.n_steps)
+    solves = latest.info.solves
+    if solves is not None and first.info.solves is not None:
+        solves = first.info.solves.joined(solves)
+    return Info(first.info.stable_dt, latest.info.n_steps, solves, latest.info.solves_saved)
 
 
 class _Unset(eqx.Module):
     """A stepper's memory that is not made yet."""
-
-
-def _whole_state(state: State) -> State:
-    return state
 
 
 def _check_steps(n_steps: int, save_every: int | None, observe: Any, check_every: int | None) -> None:

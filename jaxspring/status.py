@@ -118,6 +118,10 @@ class Status(eqx.Module):
             choose(self.count, later.count),
         )
 
+    def only_if(self, condition: Array) -> Status:
+        """This status where `condition` holds, OK where it does not."""
+        return jax.tree.map(lambda raised, ok: jnp.where(condition, raised, ok), self, Status.ok())
+
     @property
     def is_ok(self) -> Array:
         """Whether no error was raised (warnings allowed)."""

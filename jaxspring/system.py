@@ -7,7 +7,7 @@ Source: slide "System Dynamics" (Lagrange's equations of motion).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import equinox as eqx
@@ -18,6 +18,8 @@ from jaxtyping import Array
 
 from ._checks import as_inexact, has_shape, positive, shape_of
 from .forces.base import Force
+from .forces.linearisation import Linearisation
+from .linalg.operators import Blocks, SpringMatrix
 from .numerics import cast_inexact
 from .state import State
 from .topology.base import Topology
@@ -133,6 +135,29 @@ class System(eqx.Module):
             tuple(jnp.zeros_like(f) if m is None else jnp.where(m, jnp.zeros_like(f), -f) for f, m in zip(force, free, strict=True))
         )
 
+    def stiffness_blocks(self, state: State, linearisation: Linearisation) -> Blocks:
+        """K = -dF/dx [N/m], of the forces that name it."""
+        return _sum_blocks(self._cast(f, state).stiffness_blocks(state, linearisation) for f in self.forces)
+
+    def damping_blocks(self, state: State) -> Blocks:
+        """G = -dF/dv [N s/m], of the forces that name it."""
+        return _sum_blocks(self._cast(f, state).damping_blocks(state) for f in self.forces)
+
+    def incremental_potential(self, state: State, dt: Array) -> Array | None:
+        """What an implicit step minimises besides the inertia [J]; None where a force has no potential."""
+        parts = [self._cast(f, state).incremental_potential(state, dt) for f in self.forces]
+        if any(part is None for part in parts):
+            return None
+        return sum((part for part in parts if part is not None), start=jnp.zeros((), state.dtype))
+
+    def matrix(self, blocks: Blocks, state: State) -> SpringMatrix:
+        """The blocks as a matrix over the coordinates, identity where held."""
+        return SpringMatrix(blocks, self.free_masks(state.dim), state.position, state.layout)
+
+    def is_symmetric(self, state: State) -> bool:
+        """Whether every force has a symmetric Jacobian."""
+        return all(f.is_symmetric(state) for f in self.forces)
+
     def hold(self, v: Vector) -> Vector:
         """`v` where free, zero where held."""
         return Vector(tuple(a if m is None else jnp.where(m, a, jnp.zeros_like(a)) for a, m in zip(v, self.free_masks(v.dim), strict=True)))
@@ -176,6 +201,10 @@ class System(eqx.Module):
             return free
         still = ~self.motion.moved
         return tuple(still if m is None else m & still for m in free)
+
+
+def _sum_blocks(parts: Iterable[Blocks | None]) -> Blocks:
+    return sum((part for part in parts if part is not None), start=Blocks())
 
 
 def lumped_mass(net: Topology, points: Any, density: Any, triangles: Any = None) -> Array:

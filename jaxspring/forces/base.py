@@ -14,10 +14,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ..linalg.operators import Blocks
 from ..numerics import cast_inexact
 from ..state import State
 from ..status import Flag
 from ..vector import Vector
+from .linearisation import Linearisation
 
 
 class Finding(eqx.Module):
@@ -52,6 +54,28 @@ class Force(eqx.Module):
     def with_mass(self, mass: Array) -> Force:
         """The force acting on these node masses [kg]; only forces that need them answer with another object."""
         return self
+
+    def stiffness_blocks(self, state: State, linearisation: Linearisation) -> Blocks | None:
+        """-dF/dx [N/m] as blocks of nodes and springs, for implicit steps; None: taken at the old time there."""
+        return None
+
+    def damping_blocks(self, state: State) -> Blocks | None:
+        """-dF/dv [N s/m] as blocks of nodes and springs, for implicit steps; None: taken at the old time there."""
+        return None
+
+    def incremental_potential(self, state: State, dt: Array) -> Array | None:
+        """What an implicit step minimises for this force [J]: a function of the state that is reached, its time held, whose gradient by
+        position is minus the force when the velocity is displacement / dt. The energy, unless said; None where there is none.
+        """
+        return self.energy(state)
+
+    def is_symmetric(self, state: State) -> bool:
+        """Whether -dF/dx and -dF/dv are symmetric, so that conjugate gradients apply: a force with a potential is."""
+        return self.energy(state) is not None
+
+    def can_feed(self, state: State) -> bool:
+        """Whether the force can raise the sum of kinetic and potential energy; one without a potential can, unless it says no."""
+        return self.energy(state) is None
 
     def stiffness_bound(self, state: State) -> Array | None:
         """Upper bound of the row sums of |dF/dx| at each node [N/m], in node shape or a number; None where zero."""

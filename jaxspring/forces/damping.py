@@ -12,9 +12,11 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array
 
 from .._checks import as_inexact, nonnegative
+from ..linalg.operators import Blocks, SpringBlocks, isotropic
 from ..numerics import cast_inexact, tiny
 from ..state import State
 from ..topology.base import Topology
@@ -43,6 +45,22 @@ class Drag(Force):
     def force(self, state: State) -> Vector:
         """-gamma v [N]."""
         return -(self.gamma * state.velocity)
+
+    def damping_blocks(self, state: State) -> Blocks:
+        """Gamma on the diagonal [N s/m]."""
+        return Blocks((isotropic(self.gamma, state.position),))
+
+    def incremental_potential(self, state: State, dt: Array) -> Array:
+        """Dt gamma v^2 / 2, summed [J]."""
+        return jnp.sum(0.5 * dt * self.gamma.astype(state.dtype) * state.velocity.dot(state.velocity))
+
+    def is_symmetric(self, state: State) -> bool:
+        """Yes: it acts on each coordinate alone."""
+        return True
+
+    def can_feed(self, state: State) -> bool:
+        """No: drag takes energy out."""
+        return False
 
     def damping_bound(self, state: State) -> Array:
         """Gamma [N s/m]."""
@@ -83,15 +101,25 @@ class Dashpots(Force):
             return Vector.zeros_like(state.position)
 
         def pull(d: Vector, relative: Vector, c: Array) -> Vector:
-            squared = d.dot(d)
-            is_long = squared > tiny(squared.dtype)
-            # Both wheres, so that the derivative at length zero is zero and not infinity times zero.
-            rate = c * d.dot(relative) / jnp.where(is_long, squared, jnp.ones_like(squared))
-            return jnp.where(is_long, rate, jnp.zeros_like(rate)) * d
+            inverse = _inverse_length(d)
+            return (c * (d.dot(relative) * inverse) * inverse) * d
 
         d = self.net.difference(state.position)
         pulls = self.net.map_springs(pull, d, self._rate(state), self.net.edge_field(self.damping))
         return self.net.accumulate(pulls)
+
+    def damping_blocks(self, state: State) -> Blocks | None:
+        """C u u' per spring [N s/m], its direction taken as it is."""
+        if self.net.n_springs == 0:
+            return None
+        d = self.net.difference(state.position)
+        slope = self.net.map_springs(lambda d, c: jnp.broadcast_to(c, d.shape).astype(d.dtype), d, self.net.edge_field(self.damping))
+        direction = d.map(lambda d: _inverse_length(d) * d)
+        return Blocks(springs=(SpringBlocks(self.net, slope * 0, slope, direction),))
+
+    def can_feed(self, state: State) -> bool:
+        """No: a damper takes energy out."""
+        return False
 
     def damping_bound(self, state: State) -> Array | None:
         """Twice the sum of the dampers at each node [N s/m]."""
@@ -107,3 +135,11 @@ class Dashpots(Force):
 
     def _rate(self, state: State) -> EdgeField:
         return self.net.unboxed().difference(state.velocity)
+
+
+def _inverse_length(d: Vector) -> Array:
+    """1 / |d|, and zero with zero derivative where there is no length."""
+    squared = d.dot(d)
+    is_long = squared > tiny(squared.dtype)
+    # Both wheres, so that the derivative at length zero is zero and not infinity times zero.
+    return jnp.where(is_long, lax.rsqrt(jnp.where(is_long, squared, jnp.ones_like(squared))), jnp.zeros_like(squared))

@@ -20,11 +20,13 @@ from .._checks import as_inexact, nonnegative
 from ..images.image import Image
 from ..images.sampling import Bilinear
 from ..images.surface import Surface
+from ..linalg.operators import Blocks, NodeDyads
 from ..numerics import cast_inexact
 from ..state import State
 from ..status import Flag
 from ..vector import Vector
 from .base import Finding, Force, any_refused
+from .linearisation import Linearisation
 
 
 class DataSprings(Force):
@@ -70,6 +72,16 @@ class DataSprings(Force):
         x, y, z = _coordinates(state)
         error = _surface(self).value(x, y) - z
         return jnp.sum(0.5 * self.stiffness * error * error)
+
+    def stiffness_blocks(self, state: State, linearisation: Linearisation) -> Blocks:
+        """K on z [N/m]; where conservative k g g' with g = grad (d - z). The image's slope (its curvature) is left out."""
+        k = self.stiffness.astype(state.dtype)
+        x, y, z = _coordinates(state)
+        if self.conservative:
+            _, dx, dy = _surface(self).value_and_gradient(x, y)
+            return Blocks(dyads=(NodeDyads(jnp.broadcast_to(k, z.shape), Vector((dx, dy, -jnp.ones_like(z)))),))
+        zero = jnp.zeros_like(z)
+        return Blocks((Vector((zero, zero, jnp.broadcast_to(k, z.shape))),))
 
     def stiffness_bound(self, state: State) -> Array:
         """k, or k (1 + |grad d|^2) where conservative [N/m]."""

@@ -24,6 +24,7 @@ from jaxtyping import Array
 
 from ..numerics import linear_call, tiny
 from ..vector import Vector
+from .linearisation import Linearisation
 
 
 class Law(eqx.Module):
@@ -207,6 +208,14 @@ def _linearised(law: Law, squared: Array, stiffness: Array, rest_length: Array) 
     weight = jnp.where(is_long, law.weight(squared, stiffness, rest_length), stiffness)
     slope = jnp.where(is_long, law.slope(squared, stiffness, rest_length), zero)
     return weight, slope, _inverse_length(squared)
+
+
+def spring_block(
+    law: Law, linearisation: Linearisation, d: Vector, stiffness: Array, rest_length: Array
+) -> tuple[Array, Array | None, Vector]:
+    """Weight and slope [N/m] of each spring's block, and its direction (zero where it has no length)."""
+    weight, slope, inverse = _linearised(law, d.dot(d), stiffness, rest_length)
+    return *linearisation.block(jnp.broadcast_to(weight, d.shape), jnp.broadcast_to(slope, d.shape)), inverse * d
 
 
 @eqx.filter_custom_jvp

@@ -94,3 +94,11 @@ class Load(Force):
     def energy(self, state: State) -> Array | None:
         """-f . x, summed [J], where the load is constant; None where it varies in time."""
         return -jnp.sum(self.value.dot(state.position)) if isinstance(self.value, Vector) else None
+
+    def incremental_potential(self, state: State, dt: Array) -> Array:
+        """-f . x, summed [J], with the load of the state's time."""
+        return -jnp.sum(self.force(state).dot(state.position))
+
+    def is_symmetric(self, state: State) -> bool:
+        """Yes: it does not depend on the position."""
+        return True

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._checks import finite, is_concrete, nonnegative, positive
+from ..linalg.operators import Blocks, SpringBlocks
 from ..numerics import cast_inexact, tiny
 from ..state import State
 from ..status import Flag
@@ -22,7 +23,8 @@ from ..topology.base import Topology
 from ..topology.edge_field import EdgeField
 from ..vector import Vector
 from .base import Finding, Force, any_refused
-from .laws import Hooke, Law, PowerLaw, spring_energy, spring_pull
+from .laws import Hooke, Law, PowerLaw, spring_block, spring_energy, spring_pull
+from .linearisation import Linearisation
 
 
 class StiffnessRule(eqx.Module):
@@ -115,6 +117,20 @@ class Springs(Force):
         if self.law.energy(one, one, one) is None:
             return None
         return self.net.sum(self.net.map_springs(lambda *spring: spring_energy(self.law, *spring), *self._along(state)))
+
+    def stiffness_blocks(self, state: State, linearisation: Linearisation) -> Blocks | None:
+        """One block per spring [N/m]; a stiffness that follows the state is taken as constant."""
+        if self.net.n_springs == 0:
+            return None
+        blocks = self.net.map_springs(lambda *spring: spring_block(self.law, linearisation, *spring), *self._along(state))
+        weight, slope, direction = (EdgeField(column) for column in zip(*blocks.families, strict=True))
+        if slope.families[0] is None:
+            return Blocks(springs=(SpringBlocks(self.net, weight, None, None, self.axes),))
+        return Blocks(springs=(SpringBlocks(self.net, weight, slope, direction, self.axes),))
+
+    def is_symmetric(self, state: State) -> bool:
+        """Central forces are, unless the stiffness depends on position."""
+        return not isinstance(self.stiffness, StiffnessRule)
 
     def tension(self, state: State) -> EdgeField:
         """Pull of each spring along itself [N]: positive stretched, negative squeezed. `net.flatten` gives (E,)."""

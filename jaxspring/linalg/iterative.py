@@ -10,6 +10,7 @@ same matrix, whatever the number of iterations; where that fails in reverse mode
 from __future__ import annotations
 
 import abc
+import functools
 import math
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
@@ -149,7 +150,7 @@ class IterativeSolver(LinearSolver):
         is_indefinite = is_finite & (~has_numbers | (dot(ended.x, image) < 0)) & ~is_zero
         is_definite = is_finite & ~is_indefinite & ended.status.is_ok
         status = Status.when(Flag.NONFINITE, ~is_finite).then(Status.when(Flag.CG_INDEFINITE, is_indefinite))
-        status = status.then(_only_if(status.is_ok, ended.status))
+        status = status.then(ended.status.only_if(status.is_ok))
         status = status.then(Status.when(self.unconverged, is_definite & ~(residual <= _SLACK * tolerance)))
         shown = jnp.where(has_numbers, residual, jnp.full_like(residual, jnp.nan))
         return SolveInfo(jnp.where(is_zero, jnp.zeros_like(shown), shown), jnp.where(is_zero, 0, ended.iterations), status)
@@ -157,15 +158,23 @@ class IterativeSolver(LinearSolver):
 
 def dot(a: PyTree, b: PyTree) -> Array:
     """Sum of products over all entries."""
-    return jax.tree.reduce(jnp.add, jax.tree.map(lambda p, q: jnp.sum(p * q), a, b))
+    return _reduced(jnp.add, jnp.sum, jax.tree.map(jnp.multiply, a, b))
 
 
 def norm(a: PyTree) -> Array:
     """Euclidean norm that neither underflows nor overflows where the entries do not."""
-    largest = jax.tree.reduce(jnp.maximum, jax.tree.map(lambda p: jnp.max(jnp.abs(p)), a))
+    largest = _reduced(jnp.maximum, jnp.max, jax.tree.map(jnp.abs, a))
     safe = jnp.where((largest > 0) & jnp.isfinite(largest), largest, jnp.ones_like(largest))
     scaled = jax.tree.map(lambda p: p / safe, a)
     return safe * jnp.sqrt(dot(scaled, scaled))
+
+
+def _reduced(combine: Any, reduce: Any, tree: PyTree) -> Array:
+    """One number of all entries. Arrays of one shape are combined first: one pass over the memory, and one kernel to compile."""
+    leaves = jax.tree.leaves(tree)
+    if len({shape_of(leaf) for leaf in leaves}) > 1:
+        leaves = [reduce(leaf) for leaf in leaves]
+    return reduce(functools.reduce(combine, leaves))
 
 
 def _minus(a: PyTree, b: PyTree) -> PyTree:
@@ -174,10 +183,6 @@ def _minus(a: PyTree, b: PyTree) -> PyTree:
 
 def _select(condition: Array, a: PyTree, b: PyTree) -> PyTree:
     return jax.tree.map(lambda p, q: jnp.where(condition, p, q), a, b)
-
-
-def _only_if(condition: Array, status: Status) -> Status:
-    return _select(condition, status, Status.ok())
 
 
 def identity(r: PyTree) -> PyTree:

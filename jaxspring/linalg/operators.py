@@ -39,17 +39,30 @@ class SpringBlocks(eqx.Module):
     weight: EdgeField
     slope: EdgeField | None
     direction: EdgeField | None
-    axes: tuple[int, ...] | None = eqx.field(static=True, default=None)
+    axes: tuple[int, ...] | None = eqx.field(static=True)
+
+    def __init__(
+        self,
+        net: Topology,
+        weight: EdgeField,
+        slope: EdgeField | None = None,
+        direction: EdgeField | None = None,
+        axes: tuple[int, ...] | None = None,
+    ):
+        self.net = net
+        # Nothing where a lattice keeps places of springs that do not exist: products then need no mask.
+        self.weight = net.inside(weight, 0)
+        self.slope = None if slope is None else net.inside(slope, 0)
+        self.direction = direction
+        self.axes = axes
 
     def product(self, v: Vector) -> Vector:
         """D' B D v."""
         moving = v if self.axes is None else Vector(tuple(v[a] for a in self.axes))
-        d = self.net.unboxed().difference(moving)
         if self.slope is None or self.direction is None:
-            pulls = self.net.map_springs(lambda d, w: w * d, d, self.weight)
+            total = self.net.stiffness_product(lambda d, w: w * d, moving, self.weight)
         else:
-            pulls = self.net.map_springs(_block_product, d, self.weight, self.slope, self.direction)
-        total = -self.net.accumulate(pulls)
+            total = self.net.stiffness_product(_block_product, moving, self.weight, self.slope, self.direction)
         return total if self.axes is None else _embedded(total, self.axes, v)
 
     def entry(self, i: int, j: int) -> EdgeField | None:
@@ -65,8 +78,8 @@ class SpringBlocks(eqx.Module):
 
     def scaled(self, factor: Any) -> SpringBlocks:
         """The same springs with every block times `factor`."""
-        slope = None if self.slope is None else self.slope * factor
-        return SpringBlocks(self.net, self.weight * factor, slope, self.direction, self.axes)
+        scaled = eqx.tree_at(lambda b: b.weight, self, self.weight * factor)
+        return scaled if self.slope is None else eqx.tree_at(lambda b: b.slope, scaled, self.slope * factor)
 
 
 class NodeDyads(eqx.Module):

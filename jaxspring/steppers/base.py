@@ -8,6 +8,7 @@ from typing import Any
 import equinox as eqx
 from jaxtyping import Array
 
+from ..linalg.base import SolveInfo
 from ..state import State
 from ..system import System
 
@@ -26,6 +27,10 @@ class Stepper(eqx.Module):
     @abc.abstractmethod
     def step(self, system: System, state: State, dt: Array, memory: Any) -> tuple[State, Any]:
         """The state one `dt` [s] later, and what to carry. The caller sets the new state's time."""
+
+    def report(self, memory: Any) -> SolveInfo | None:
+        """How the linear or nonlinear solve of the last step ended; None for a stepper that solves nothing."""
+        return None
 
     def limit(self, squared_frequency: Array, damping: Array, damping_floor: Array) -> Array | None:
         """Largest stable dt [s] for motions of at most that squared frequency [1/s^2] and a damping rate c = gamma / m [1/s] within the

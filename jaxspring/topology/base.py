@@ -73,6 +73,11 @@ class Topology(eqx.Module):
     def accumulate(self, pulls: EdgeField) -> Vector:
         """Force on each node from the pull of each spring: plus on its tail, minus on its head."""
 
+    def stiffness_product(self, block: Callable[..., Vector], v: Vector, *fields: EdgeField) -> Vector:
+        """D' B D v, where `block(d, *fields of a family)` is B d and vanishes where no spring exists; periods do not wrap `v`."""
+        net = self.unboxed()
+        return -net.accumulate(net.map_springs(block, net.difference(v), *fields))
+
     @abc.abstractmethod
     def incident_sum(self, values: EdgeField) -> Array:
         """Sum over the springs at each node, whichever end: node shape."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -138,6 +138,17 @@ class Lattice(Topology):
         columns = zip(*(pull.components for pull in pulls.families), strict=True)
         return -Vector(tuple(linear_call(forward, backward, (), tuple(column)) for column in columns))
 
+    def stiffness_product(self, block: Callable[..., Vector], v: Vector, *fields: EdgeField) -> Vector:
+        """D' B D v without masks, since B vanishes in the margins."""
+        if not self.offsets:
+            return Vector.zeros_like(v)
+        apart, together = partial(_difference_anywhere, self.grid_shape), partial(_minus_accumulate_anywhere, self.grid_shape)
+        columns = [linear_call(apart, together, (), a) for a in v]
+        d = EdgeField(tuple(Vector(parts) for parts in zip(*columns, strict=True)))
+        pulls = self.map_springs(block, d, *fields)
+        back = zip(*(pull.components for pull in pulls.families), strict=True)
+        return Vector(tuple(linear_call(together, apart, (), tuple(column)) for column in back))
+
     def incident_sum(self, values: EdgeField) -> Array:
         """Sum over the springs at each node."""
         if not self.offsets:
@@ -248,6 +259,14 @@ def _difference(grid: shifts.Grid, _: Any, x: Array) -> tuple[Array, ...]:
 
 def _minus_accumulate(grid: shifts.Grid, _: Any, pulls: tuple[Array, ...]) -> Array:
     return -shifts.accumulate(grid, pulls)
+
+
+def _difference_anywhere(grid: shifts.Grid, _: Any, x: Array) -> tuple[Array, ...]:
+    return shifts.difference_anywhere(grid, x)
+
+
+def _minus_accumulate_anywhere(grid: shifts.Grid, _: Any, pulls: tuple[Array, ...]) -> Array:
+    return -shifts.accumulate_anywhere(grid, pulls)
 
 
 def _sum_of_ends(grid: shifts.Grid, _: Any, a: Array) -> tuple[Array, ...]:

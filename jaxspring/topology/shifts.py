@@ -51,19 +51,27 @@ class Grid(NamedTuple):
 
 def difference(grid: Grid, x: Array) -> tuple[Array, ...]:
     """Head minus tail, per family; zero where a spring does not exist."""
-    padded = _pad(x, grid.reach)
-    found = []
-    for offset in grid.offsets:
-        tail, head = _ends(grid, padded, offset)
-        found.append(inside(grid, head - tail, offset, 0))
-    return tuple(found)
+    found = difference_anywhere(grid, x)
+    return tuple(inside(grid, d, offset, 0) for d, offset in zip(found, grid.offsets, strict=True))
 
 
 def accumulate(grid: Grid, pulls: tuple[Array, ...]) -> Array:
     """Each pull on its tail, the opposite on its head: minus the transpose of `difference`."""
+    return accumulate_anywhere(grid, tuple(inside(grid, p, offset, 0) for p, offset in zip(pulls, grid.offsets, strict=True)))
+
+
+def difference_anywhere(grid: Grid, x: Array) -> tuple[Array, ...]:
+    """As `difference`, without the mask: in the margins a node outside counts as zero."""
+    padded = _pad(x, grid.reach)
+    ends = [_ends(grid, padded, offset) for offset in grid.offsets]
+    return tuple(head - tail for tail, head in ends)
+
+
+def accumulate_anywhere(grid: Grid, pulls: tuple[Array, ...]) -> Array:
+    """As `accumulate`, without the mask: minus the transpose of `difference_anywhere`."""
     total = None
     for offset, pull in zip(grid.offsets, pulls, strict=True):
-        tail, head = _at_nodes(grid, inside(grid, pull, offset, 0), offset)
+        tail, head = _at_nodes(grid, pull, offset)
         total = tail - head if total is None else total + (tail - head)
     return jnp.zeros(grid.shape) if total is None else total
 
@@ -89,13 +97,15 @@ def sum_at_nodes(grid: Grid, values: tuple[Array, ...]) -> Array:
 
 def inside(grid: Grid, value: Array, offset: Offset, fill: float) -> Array:
     """`value` where the family's springs exist, `fill` elsewhere."""
+    shape = grid.extended(offset)
     exists = None
-    for axis, margin in enumerate(grid.margin(offset)):
+    for axis, (margin, n) in enumerate(zip(grid.margin(offset), grid.shape, strict=True)):
         if margin:
-            place = lax.broadcasted_iota(np.int32, grid.extended(offset), axis)
-            here = (place >= margin) & (place < grid.shape[axis])
+            # A constant of one axis: a program holds it once, and it compiles sooner than a comparison of indices.
+            place = np.arange(shape[axis])
+            here = lax.broadcast_in_dim((place >= margin) & (place < n), shape, (axis,))
             exists = here if exists is None else exists & here
-    return value if exists is None else jnp.where(exists, value, jnp.asarray(fill, value.dtype))
+    return value if exists is None else lax.select(exists, value, jnp.full(shape, fill, value.dtype))
 
 
 def extend(grid: Grid, value: Array, offset: Offset, fill: float) -> Array:

@@ -1,0 +1,78 @@
+"""Solves with an exact Jacobian, for derivatives: it need not be symmetric, nor positive definite.
+
+Conjugate gradients where the Jacobian is symmetric, stopping at negative curvature; the stabilised bi-conjugate gradients of
+`jax.scipy` where it is not. Both are preconditioned by the clamped, positive definite matrix of the same step. A solve that fails
+gives NaN, never a half-converged derivative.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.scipy.sparse.linalg import bicgstab
+
+from ..vector import Vector
+from .cg import CG
+from .operators import SpringMatrix
+
+Operator = Callable[[Vector], Vector]
+
+
+class ExactSolver(eqx.Module):
+    """How derivatives of converged solutions are solved for.
+
+    Attributes:
+        cg: for symmetric Jacobians; its preconditioner serves both.
+        allow_nonsymmetric: False refuses systems with non-symmetric forces instead of changing the method.
+    """
+
+    cg: CG
+    allow_nonsymmetric: bool = eqx.field(static=True)
+
+    def __init__(self, cg: CG | None = None, allow_nonsymmetric: bool = True):
+        self.cg = CG() if cg is None else cg
+        self.allow_nonsymmetric = allow_nonsymmetric
+
+    def solve_exact(self, jacobian: Operator, b: Vector, nearby: SpringMatrix, is_symmetric: bool) -> Vector:
+        """Solve `jacobian` x = b, linear in b.
+
+        Args:
+            jacobian: x -> J x.
+            b: right-hand side.
+            nearby: a positive definite matrix close to J.
+            is_symmetric: whether J is.
+
+        Raises:
+            TypeError: J is not symmetric, and only conjugate gradients were allowed.
+        """
+        precondition = self.cg.preconditioner.build(lax.stop_gradient(nearby))
+        if is_symmetric:
+            return self.cg.solve(jacobian, b, precondition)[0]
+        if not self.allow_nonsymmetric:
+            raise TypeError(
+                "A force of this system has a Jacobian that is not symmetric (DataSprings that pull z alone, a stiffness that follows an "
+                "image, Dashpots, or a force of your own without an energy), and conjugate gradients need symmetry. "
+                "Allow bi-conjugate gradients: ExactSolver(allow_nonsymmetric=True)."
+            )
+
+        def solve(operator: Operator, rhs: Vector) -> Vector:
+            return self._stabilised(operator, rhs, precondition)
+
+        return lax.custom_linear_solve(jacobian, b, solve, transpose_solve=solve)
+
+    def _stabilised(self, operator: Operator, b: Vector, precondition: Operator) -> Vector:
+        norm = jnp.sqrt(jnp.sum(b.dot(b)))
+        scale = jnp.where(norm > 0, norm, jnp.ones_like(norm))
+        unit = b / scale
+        tolerance = self.cg.tolerance or (1e-8 if norm.dtype == jnp.float64 else 1e-5)
+        x, _ = bicgstab(operator, unit, tol=tolerance, maxiter=self.cg.max_iter, M=precondition)
+        left = unit - operator(x)
+        is_solved = jnp.sum(left.dot(left)) <= (10 * tolerance) ** 2
+        return jax.tree.map(lambda a: jnp.where(is_solved, a * scale, jnp.full_like(a, jnp.nan)), x)
+
+
+__all__ = ["ExactSolver"]

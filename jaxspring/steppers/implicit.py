@@ -1,0 +1,254 @@
+"""Implicit steppers: stable at steps far above the explicit limit.
+
+    BackwardEuler        v' at x' = x + dt v'                                                     order 1, damps every motion
+    ImplicitMidpoint     v* at x* = x + dt/2 v*;   x' = x + dt v*,  v' = 2 v* - v                 order 2, keeps energy of linear systems
+    BDF2                 v' at x' = (4 x - x_1 + 2 dt v') / 3, from (4 v - v_1) / 3               order 2, damps stiff motions
+
+where v at x means M (v - v0) / h = f(x, v). Each is one stage (`stage.py`): a linear solve with M/h + G + h K, or Newton's method.
+
+What enters: springs (K, the tangent clamped positive semi-definite), data springs (K), drag, dashpots and Rayleigh damping (G). What is
+taken at the old time: the change of a stiffness that follows an image, the slope of an image under `ImageAttraction`, the turning of a
+dashpot, and any force that names neither; Newton's step takes all of them at the new time. Loads are taken at the stage's time.
+
+Source: slide "Implicit Solution" for backward Euler; Hairer and Wanner (1996) for the others.
+"""
+
+from __future__ import annotations
+
+import abc
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ..forces.linearisation import Linearisation, Tangent
+from ..linalg.base import LinearSolver, SolveInfo
+from ..linalg.cg import JaxCG
+from ..linalg.exact import ExactSolver
+from ..numerics import stopped
+from ..state import State
+from ..status import NOWHERE, Flag, Status
+from ..system import Energy, System
+from ..vector import Vector
+from .base import Stepper
+from .newton import Newton, NewtonStage
+from .stage import LinearStage, Stage, known_velocity
+
+
+class Memory(eqx.Module):
+    """What an implicit stepper carries.
+
+    Attributes:
+        solver: what the linear solver carries, such as a factor.
+        info: how the last solve ended.
+        history: earlier states, where the method needs them.
+        energy: of the state before the next step, where nothing can feed energy in; else None.
+    """
+
+    solver: Any
+    info: SolveInfo
+    history: Any
+    energy: Energy | None
+
+
+class ImplicitStepper(Stepper):
+    """A stepper of implicit stages. Abstract.
+
+    Attributes:
+        solver: for the linear systems.
+        newton: None for one linear solve per step; a `Newton` for a converged step.
+        stiffness: what stands for K in the linear solve; `Secant()` is the slides' form, stable only below omega dt = 2.
+        adjoint: solver of the derivatives of Newton's steps, whose matrix is the exact one.
+    """
+
+    solver: LinearSolver
+    newton: Newton | None
+    stiffness: Linearisation
+    adjoint: ExactSolver
+
+    def __init__(
+        self,
+        solver: LinearSolver | None = None,
+        newton: bool | Newton | None = None,
+        stiffness: Linearisation | None = None,
+        adjoint: ExactSolver | None = None,
+    ):
+        self.solver = JaxCG() if solver is None else solver
+        wanted = self.is_newton_by_default() if newton is None else newton
+        self.newton = Newton() if wanted is True else (wanted or None)
+        self.stiffness = Tangent() if stiffness is None else stiffness
+        self.adjoint = ExactSolver() if adjoint is None else adjoint
+        if self.newton is not None and stiffness is not None:
+            raise ValueError(
+                "stiffness says what a single linear solve uses; Newton's directions are always the clamped tangent. Pass one."
+            )
+        if self.newton is None and adjoint is not None:
+            raise ValueError("adjoint serves Newton's steps; the derivative of a linear solve uses the solver itself. Pass newton=True.")
+
+    @classmethod
+    @abc.abstractmethod
+    def is_newton_by_default(cls) -> bool:
+        """Whether the order of the method needs converged steps."""
+
+    @abc.abstractmethod
+    def stage(self, system: System, state: State, dt: Array, history: Any) -> Stage:
+        """The equations of this step."""
+
+    @abc.abstractmethod
+    def finish(self, state: State, dt: Array, stage: Stage, y: Vector) -> State:
+        """The new state from the stage's velocity."""
+
+    def remember(self, state: State) -> Any:
+        """What of the state before a step the next one needs."""
+        return None
+
+    def first_history(self, state: State) -> Any:
+        """What stands for the states before the first one."""
+        return None
+
+    def energy_slack(self, dtype: Any) -> float:
+        """Rise of the energy in a step, over the energy exchanged in it, that is not yet reported."""
+        return 1e-6 if dtype == jnp.float64 else 1e-3
+
+    def init(self, system: System, state: State) -> Memory:
+        """An empty memory of the right shape."""
+        dt = jnp.ones((), state.dtype)
+        history = self.first_history(state)
+        stage = self.stage(system, state, dt, history)
+        carried = self.solver.init(stage.matrix(state, self.stiffness))
+        nothing = SolveInfo(jnp.zeros((), state.dtype), jnp.zeros((), jnp.int32), Status.ok())
+        return Memory(carried, nothing, history, _closed_energy(system, state))
+
+    def step(self, system: System, state: State, dt: Array, memory: Memory) -> tuple[State, Memory]:
+        """One stage, and the state after it."""
+        stage = self.stage(system, state, dt, memory.history)
+        if self.newton is None:
+            problem: Any = LinearStage(self.solver, self.stiffness)
+        else:
+            problem = NewtonStage(self.solver, self.adjoint, self.newton)
+        y, info, carried = problem.solve(stage, memory.solver)
+        new = self.finish(state, dt, stage, y)
+        energy = _closed_energy(system, new)
+        status = _breakdown(stage, new).then(info.status).then(self._energy_status(memory.energy, energy))
+        return new, Memory(carried, SolveInfo(info.residual, info.iterations, status), self.remember(state), energy)
+
+    def report(self, memory: Memory) -> SolveInfo:
+        """How the last solve ended."""
+        return memory.info
+
+    def _energy_status(self, old: Energy | None, new: Energy | None) -> Status:
+        """ENERGY_ROSE, where nothing in the system can feed energy in."""
+        if old is None or new is None:
+            return Status.ok()
+        dtype = new.kinetic.dtype
+        entries = zip((old.kinetic, *old.potential), (new.kinetic, *new.potential), strict=True)
+        pairs = [(a, b) for a, b in entries if a is not None and b is not None]
+        rise = sum((b - a for a, b in pairs), start=jnp.zeros((), dtype))
+        exchanged = sum((jnp.abs(b - a) for a, b in pairs), start=jnp.zeros((), dtype))
+        size = sum((jnp.abs(a) for a, _ in pairs), start=jnp.zeros((), dtype))
+        rounding = 64 * float(jnp.finfo(dtype).eps)
+        return Status.when(Flag.ENERGY_ROSE, rise > self.energy_slack(dtype) * exchanged + rounding * size)
+
+
+class BackwardEuler(ImplicitStepper):
+    """Backward Euler: one linear solve, or a converged step with `newton=True`."""
+
+    @classmethod
+    def is_newton_by_default(cls) -> bool:
+        """No: one linear solve keeps order 1."""
+        return False
+
+    def stage(self, system: System, state: State, dt: Array, history: None) -> Stage:
+        """The forces at the end of the step."""
+        return _stage(system, state, state.position, state.velocity, dt, state.time + dt)
+
+    def finish(self, state: State, dt: Array, stage: Stage, y: Vector) -> State:
+        """The stage's state is the new state."""
+        return stage.reached(y)
+
+
+class ImplicitMidpoint(ImplicitStepper):
+    """The implicit midpoint rule, converged unless `newton=False`: order 2, no damping of its own.
+
+    It keeps the energy of linear systems. Motions above the step's resolution ring without dying out: `BDF2` damps them.
+    """
+
+    @classmethod
+    def is_newton_by_default(cls) -> bool:
+        """Yes: the clamped tangent of a single solve would lower the order where springs are squeezed."""
+        return True
+
+    def stage(self, system: System, state: State, dt: Array, history: None) -> Stage:
+        """The forces in the middle of the step."""
+        return _stage(system, state, state.position, state.velocity, 0.5 * dt, state.time + 0.5 * dt)
+
+    def finish(self, state: State, dt: Array, stage: Stage, y: Vector) -> State:
+        """X + dt v*, 2 v* - v."""
+        middle = stage.full(y)
+        return State(state.time + dt, state.position + dt * middle, stage.system.hold(2 * middle - state.velocity), state.layout)
+
+    def energy_slack(self, dtype: Any) -> float:
+        """Half of the energy exchanged: the rule keeps a nearby energy, about which the true one swings."""
+        return 0.5
+
+
+class BDF2(ImplicitStepper):
+    """The two-step backward differentiation formula, converged unless `newton=False`; its first step is backward Euler's."""
+
+    @classmethod
+    def is_newton_by_default(cls) -> bool:
+        """Yes: the clamped tangent of a single solve would lower the order where springs are squeezed."""
+        return True
+
+    def first_history(self, state: State) -> tuple[Array, Vector, Vector]:
+        """No state before the first."""
+        return jnp.zeros((), bool), state.position, state.velocity
+
+    def remember(self, state: State) -> tuple[Array, Vector, Vector]:
+        """The state before this step."""
+        return jnp.ones((), bool), state.position, state.velocity
+
+    def stage(self, system: System, state: State, dt: Array, history: tuple[Array, Vector, Vector]) -> Stage:
+        """Differences of this state and the last one, in the form that leaves a node at rest exactly where it is."""
+        has_last, x, v = history
+        third = jnp.where(has_last, jnp.asarray(1 / 3, dt.dtype), jnp.zeros((), dt.dtype))
+        origin = state.position + third * (state.position - x)
+        velocity = state.velocity + third * (state.velocity - v)
+        return _stage(system, state, origin, velocity, (1 - third) * dt, state.time + dt)
+
+    def finish(self, state: State, dt: Array, stage: Stage, y: Vector) -> State:
+        """The stage's state is the new state."""
+        return stage.reached(y)
+
+    def energy_slack(self, dtype: Any) -> float:
+        """A tenth of the energy exchanged: what the method lets fall is a sum over two steps."""
+        return 0.1
+
+
+def _closed_energy(system: System, state: State) -> Energy | None:
+    """The energy of a state, if nothing in the system can feed energy in."""
+    if system.motion is not None or any(force.can_feed(state) for force in system.forces):
+        return None
+    return stopped(system.energy(state))
+
+
+def _breakdown(stage: Stage, after: State) -> Status:
+    """NONFINITE, naming the node and the first effect whose force was not finite before the step."""
+    finite = [jnp.isfinite(a) for v in (after.position, after.velocity) for a in v]
+    bad = ~jnp.all(jnp.stack(finite), axis=0)
+    effect = jnp.asarray(NOWHERE, jnp.int32)
+    for i, force in reversed(list(enumerate(stage.system.forces))):
+        fails = ~jnp.all(jnp.isfinite(jnp.stack(force.force(stage.predictor).components)))
+        effect = jnp.where(fails, jnp.asarray(i, jnp.int32), effect)
+    node = jnp.argmax(jnp.ravel(bad)).astype(jnp.int32)
+    status = Status.when(Flag.NONFINITE, jnp.any(bad), node=node, count=jnp.sum(bad))
+    return eqx.tree_at(lambda s: s.effect, status, jnp.where(jnp.any(bad), effect, status.effect))
+
+
+def _stage(system: System, state: State, origin: Vector, velocity: Vector, h: Array, time: Array) -> Stage:
+    predictor = State(time, state.position, state.velocity, state.layout)
+    return Stage(system, origin, velocity, h, time, predictor, known_velocity(system, origin, h, time), origin is state.position)
+
+
+__all__ = ["BDF2", "BackwardEuler", "ImplicitMidpoint", "ImplicitStepper"]

@@ -1,0 +1,168 @@
+"""Newton's method for an implicit stage, with a line search on what the stage minimises.
+
+    Phi(y) = sum M (y - v0)^2 / 2 + sum over forces of their potential at x0 + h y        grad Phi = h r(y)
+
+    A d = -r,   A = M/h + G + h K clamped positive semi-definite        a direction in which Phi falls
+    y <- y + a d,   a = 1, 1/2, 1/4, ...                                until Phi falls enough
+
+Where a force has no potential, |r|^2 takes the place of Phi. The direction uses the clamped tangent, the derivative of the result the
+exact one: with the clamped one in its place every gradient of a squeezed net would be silently wrong.
+
+Source: Gast and others (2015), "Optimization Integrator for Large Time Steps", for the potential.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from ..forces.linearisation import Tangent
+from ..linalg.base import LinearSolver, SolveInfo
+from ..linalg.implicit import ImplicitProblem, implicitly
+from ..status import Flag, Status
+from ..vector import Vector
+from .stage import Stage
+
+
+class Newton(eqx.Module):
+    """How far Newton's method goes.
+
+    Attributes:
+        tolerance: wanted residual over the size of the forces; None is 1e-10 in float64 and 1e-5 in float32.
+        max_iter: most iterations.
+        max_halvings: most halvings of a step in the line search.
+    """
+
+    tolerance: float | None = eqx.field(static=True, default=None)
+    max_iter: int = eqx.field(static=True, default=30)
+    max_halvings: int = eqx.field(static=True, default=20)
+
+
+class _Progress(eqx.Module):
+    """Where the iteration stands."""
+
+    y: Vector
+    r: Vector
+    norm: Array
+    merit: Array
+    newton_iterations: Array
+    iterations: Array
+    status: Status
+    memory: Any
+
+
+class NewtonStage(ImplicitProblem):
+    """The stage solved to convergence.
+
+    Attributes:
+        solver: for the directions.
+        adjoint: for derivatives, whose matrix is exact and may be indefinite.
+        options: when to stop.
+    """
+
+    solver: LinearSolver
+    adjoint: Any
+    options: Newton
+
+    def residual(self, stage: Stage, y: Vector) -> Vector:
+        """M (y - v0) / h - f(x0 + h y, y, t) [N]."""
+        return stage.on_free(stage.inertia(y) - stage.system.force(stage.reached(y)), y)
+
+    def solve_linearised(self, stage: Stage, y: Vector, right_side: Vector) -> Vector:
+        """(dr/dy)^-1 right_side, with the exact derivative."""
+
+        def jacobian(u: Vector) -> Vector:
+            return jax.jvp(lambda y: self.residual(stage, y), (y,), (u,))[1]
+
+        state = jax.lax.stop_gradient(stage.reached(y))
+        is_symmetric = stage.system.is_symmetric(state)
+        return self.adjoint.solve_exact(jacobian, right_side, stage.matrix(state, Tangent()), is_symmetric)
+
+    def solve(self, stage: Stage, memory: Any) -> tuple[Vector, SolveInfo, Any]:
+        """The stage's velocity with its derivative, how the solve ended, and what the solver carries on."""
+        still = eqx.combine(lax.stop_gradient(eqx.filter(stage, eqx.is_inexact_array)), stage)
+        start = still.system.hold(still.predictor.velocity)
+        scale = self._scale(still)
+        tolerance = self.options.tolerance or (1e-10 if start.dtype == jnp.float64 else 1e-5)
+        merit = self._merit(still)
+
+        def goes_on(at: _Progress) -> Array:
+            is_done = at.norm <= tolerance * scale
+            return ~is_done & (at.newton_iterations < self.options.max_iter) & jnp.isfinite(at.norm) & ~at.status.has(Flag.LINE_SEARCH)
+
+        first = self.residual(still, start)
+        zero = jnp.zeros((), jnp.int32)
+        begin = _Progress(start, first, _norm(first), merit(start, first), zero, zero, Status.ok(), memory)
+        end = lax.while_loop(goes_on, lambda at: self._iterate(still, merit, at), begin)
+        converged = end.norm <= tolerance * scale
+        failed = end.status.then(Status.when(Flag.SOLVER, ~converged))
+        status = jax.tree.map(lambda ok, bad: jnp.where(converged, ok, bad), Status.ok(), failed)
+        relative = end.norm / jnp.where(scale > 0, scale, jnp.ones_like(scale))
+        return implicitly(self, stage, end.y), SolveInfo(relative, end.iterations, status), end.memory
+
+    def _iterate(self, stage: Stage, merit: Any, at: _Progress) -> _Progress:
+        matrix = stage.matrix(stage.reached(at.y), Tangent())
+        direction, info, memory = self.solver.solve_in_step(matrix, -at.r, None, at.memory)
+        # Phi falls along d at the rate h r.d; |r|^2 is taken to fall at the rate -2 |r|^2 times the step.
+        slope = stage.h * _dot(at.r, direction) if self._has_potential(stage) else -2 * at.norm * at.norm
+        # Phi is a difference of large numbers: below this, its fall is rounding.
+        rounding = jnp.asarray(16 * float(jnp.finfo(at.norm.dtype).eps), at.norm.dtype) * jnp.abs(at.merit)
+
+        def trial(step: Array) -> tuple[Vector, Vector, Array, Array]:
+            y = at.y + step * direction
+            r = self.residual(stage, y)
+            value = merit(y, r)
+            falls = (value <= at.merit + 1e-4 * step * slope + rounding) & jnp.isfinite(value)
+            return y, r, value, falls
+
+        def halve(found: Any) -> Any:
+            step, count, *_ = found
+            return 0.5 * step, count + 1, *trial(0.5 * step)
+
+        one = jnp.ones((), at.norm.dtype)
+        begin = (one, jnp.zeros((), jnp.int32), *trial(one))
+        _, _, y, r, value, falls = lax.while_loop(lambda f: ~f[-1] & (f[1] < self.options.max_halvings), halve, begin)
+        status = at.status.then(info.status).then(Status.when(Flag.LINE_SEARCH, ~falls))
+        y, r, value = jax.tree.map(lambda new, old: jnp.where(falls, new, old), (y, r, value), (at.y, at.r, at.merit))
+        iterations = at.iterations + jnp.maximum(info.iterations, 0)
+        return _Progress(y, r, _norm(r), value, at.newton_iterations + 1, iterations, status, memory)
+
+    def _has_potential(self, stage: Stage) -> bool:
+        return stage.system.incremental_potential(stage.predictor, stage.h) is not None
+
+    def _merit(self, stage: Stage) -> Any:
+        """What the line search wants to fall: (y, r) -> Phi, or |r|^2 without a potential."""
+        if not self._has_potential(stage):
+            return lambda y, r: _dot(r, r)
+        mass = stage.system.mass.astype(stage.h.dtype)
+
+        def potential(y: Vector, r: Vector) -> Array:
+            change = stage.full(y) - stage.velocity
+            of_forces = stage.system.incremental_potential(stage.reached(y), stage.h)
+            inertia = 0.5 * jnp.sum(mass * change.dot(change))
+            return inertia if of_forces is None else inertia + of_forces
+
+        return potential
+
+    def _scale(self, stage: Stage) -> Array:
+        """Size of the forces [N], each effect by itself, so that a balance of large forces is not taken for their absence."""
+        at = stage.predictor
+        sizes = [_norm(force.force(at)) for force in stage.system.forces]
+        inertia = _norm((stage.system.mass.astype(stage.h.dtype) / stage.h) * stage.velocity)
+        return sum(sizes, start=inertia)
+
+
+def _dot(a: Vector, b: Vector) -> Array:
+    return jnp.sum(a.dot(b))
+
+
+def _norm(a: Vector) -> Array:
+    return jnp.sqrt(_dot(a, a))
+
+
+__all__ = ["Newton", "NewtonStage"]

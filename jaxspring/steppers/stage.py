@@ -1,0 +1,138 @@
+"""One implicit stage: the velocity y that solves the equations of motion at the state which it reaches.
+
+    M (y - v0) / h = f(x0 + h y, y, t)                                              implicit
+    M (y - v0) / h = f_p - K (x0 + h y - x_p) - G (y - v_p)         linearised at a predictor p
+
+Backward Euler, the implicit midpoint rule and BDF2 are this stage with other x0, v0, h and t. The linearised form is one solve with
+
+    A = M/h + G + h K
+
+Held coordinates are known beforehand: they are no part of the solve, and do not move by a rounding error.
+
+Source: slide "Implicit Solution", with the tangent stiffness and the force in place of K x.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from ..forces.linearisation import Linearisation
+from ..linalg.base import LinearSolver, SolveInfo
+from ..linalg.implicit import ImplicitProblem, implicitly
+from ..linalg.operators import Blocks, SpringMatrix, isotropic
+from ..numerics import stopped
+from ..state import State
+from ..system import System
+from ..vector import Vector
+
+
+class Stage(eqx.Module):
+    """What is given of a stage.
+
+    Attributes:
+        system: masses, forces and constraints.
+        origin: x0 [m].
+        velocity: v0 [m/s].
+        h: [s].
+        time: t [s], when the forces are taken.
+        predictor: the state at which forces are linearised.
+        known: velocity of held and moved coordinates [m/s], zero elsewhere.
+        starts_there: whether x0 is the predictor's position (static).
+    """
+
+    system: System
+    origin: Vector
+    velocity: Vector
+    h: Array
+    time: Array
+    predictor: State
+    known: Vector
+    starts_there: bool = eqx.field(static=True)
+
+    def full(self, y: Vector) -> Vector:
+        """`y` where free, the known velocity where not."""
+        return self.system.matrix(Blocks(), self.predictor).pick(y, self.known)
+
+    def reached(self, y: Vector) -> State:
+        """The state that the velocity `y` leads to."""
+        v = self.full(y)
+        return State(self.time, self.origin + self.h * v, v, self.predictor.layout)
+
+    def inertia(self, y: Vector) -> Vector:
+        """M (y - v0) / h [N]."""
+        return (self.system.mass.astype(y.dtype) / self.h) * (self.full(y) - self.velocity)
+
+    def matrix(self, state: State, linearisation: Linearisation) -> SpringMatrix:
+        """M/h + G + h K at a state."""
+        # Computed once: without the barrier XLA computes every block anew in each loop and preconditioner that reads it.
+        return lax.optimization_barrier(self.system.matrix(self.blocks(state, linearisation), state))
+
+    def blocks(self, state: State, linearisation: Linearisation) -> Blocks:
+        """M/h + G + h K at a state, no coordinate held."""
+        inertia = Blocks((isotropic(self.system.mass.astype(state.dtype) / self.h, state.position),))
+        stiffness = self.system.stiffness_blocks(state, linearisation).scaled(self.h)
+        return inertia + self.system.damping_blocks(state) + stiffness
+
+    def on_free(self, r: Vector, y: Vector) -> Vector:
+        """Equations where free, y = 0 where known."""
+        return self.system.matrix(Blocks(), self.predictor).pick(r, y)
+
+
+class LinearStage(ImplicitProblem):
+    """The linearised stage: one linear solve.
+
+    Attributes:
+        solver: for A.
+        linearisation: what stands for K.
+    """
+
+    solver: LinearSolver
+    linearisation: Linearisation
+
+    def residual(self, stage: Stage, y: Vector) -> Vector:
+        """A y - b where free [N]."""
+        blocks = stage.blocks(stage.predictor, self.linearisation)
+        return stage.on_free(blocks.product(stage.full(y)) - self._right_side(stage), y)
+
+    def solve_linearised(self, stage: Stage, y: Vector, right_side: Vector) -> Vector:
+        """A^-1 right_side."""
+        matrix = stage.matrix(stage.predictor, self.linearisation)
+        return self.solver.solve_in_step(matrix, right_side, None, self.solver.init(matrix))[0]
+
+    def solve(self, stage: Stage, memory: Any) -> tuple[Vector, SolveInfo, Any]:
+        """The stage's velocity with its derivative, how the solve ended, and what the solver carries on."""
+        still = stopped(stage)
+        matrix = still.matrix(still.predictor, self.linearisation)
+        right_side = self._right_side(still)
+        if still.system.motion is not None:
+            right_side = right_side - matrix.blocks.product(still.known)
+        zero = Vector.zeros_like(right_side)
+        y, info, memory = self.solver.solve_in_step(matrix, still.on_free(right_side, zero), still.predictor.velocity, memory)
+        return implicitly(self, stage, y), info, memory
+
+    def _right_side(self, stage: Stage) -> Vector:
+        """B = M v0 / h + f_p + G v_p - K (x0 - x_p) [N]."""
+        at = stage.predictor
+        b = (stage.system.mass.astype(at.dtype) / stage.h) * stage.velocity + stage.system.force(at)
+        b = b + stage.system.damping_blocks(at).product(at.velocity)
+        if stage.starts_there:
+            return b
+        return b - stage.system.stiffness_blocks(at, self.linearisation).product(stage.origin - at.position)
+
+
+def known_velocity(system: System, origin: Vector, h: Array, time: Array) -> Vector:
+    """Velocity of the held (zero) and of the moved coordinates, which reach their scheduled place at `time` [m/s]."""
+    zero = Vector.zeros_like(origin)
+    if system.motion is None:
+        return zero
+    place, _ = system.motion.at(time)
+    moved = system.motion.moved
+    return zero.map(lambda z, to, x: jnp.where(moved, ((to.astype(x.dtype) - x) / h), z), place, origin)
+
+
+__all__ = ["LinearStage", "Stage", "known_velocity"]

@@ -176,8 +176,9 @@ def _tangent(static: Any, residuals: Any, operand: Any) -> Vector:
     """Dp = w dd + s u (u . dd) + (w_k dk + w_l dl + ...) d."""
     d, stiffness, rest_length, params = residuals
     dd, *constants = operand
-    squared = d.dot(d)
-    weight, slope, inverse = _linearised(eqx.combine(params, static), squared, stiffness, rest_length)
+    squared, is_long = _guarded(d)
+    weight, slope = _linearised(eqx.combine(params, static), squared, is_long, stiffness, rest_length)
+    inverse = lax.rsqrt(squared)
     of_constants = partial(_weight, static, squared)
     _, by_constants = jax.jvp(of_constants, (stiffness, rest_length, params), tuple(constants))
     along = slope * (d.dot(dd) * inverse) * inverse + by_constants
@@ -187,13 +188,14 @@ def _tangent(static: Any, residuals: Any, operand: Any) -> Vector:
 def _tangent_transpose(static: Any, residuals: Any, q: Vector) -> Any:
     """The same block on q, as it is symmetric; and the products with the derivatives of the weight."""
     d, stiffness, rest_length, params = residuals
-    squared = d.dot(d)
-    weight, slope, inverse = _linearised(eqx.combine(params, static), squared, stiffness, rest_length)
+    squared, is_long = _guarded(d)
+    weight, slope = _linearised(eqx.combine(params, static), squared, is_long, stiffness, rest_length)
+    inverse = lax.rsqrt(squared)
     # A division, so that XLA keeps it as an array of its own instead of computing it anew in each of its five readers.
-    length = jnp.maximum(squared, tiny(squared.dtype)) * inverse
+    length = squared * inverse
     along = d.dot(q) / length
     _, pullback = jax.vjp(partial(_weight, static, squared), stiffness, rest_length, params)
-    dk, dl, dparams = pullback(along * (squared * inverse))
+    dk, dl, dparams = pullback(along * length)
     return weight * q + (slope * along * inverse) * d, dk, dl, dparams
 
 
@@ -201,21 +203,30 @@ def _weight(static: Any, squared: Array, stiffness: Array, rest_length: Array, p
     return eqx.combine(params, static).weight(squared, stiffness, rest_length)
 
 
-def _linearised(law: Law, squared: Array, stiffness: Array, rest_length: Array) -> tuple[Array, Array, Array]:
-    """Weight, slope and inverse length for the derivative; a spring of no length is taken as k I."""
+def _guarded(d: Vector) -> tuple[Array, Array]:
+    """Squared length, 1 where there is none; and where there is one. Before the law, not only after it: at length zero a derivative of
+    what follows is then zero, and not infinity times zero.
+    """
+    squared = d.dot(d)
     is_long = squared > tiny(squared.dtype)
-    zero = jnp.zeros((), squared.dtype)
+    return jnp.where(is_long, squared, jnp.ones_like(squared)), is_long
+
+
+def _linearised(law: Law, squared: Array, is_long: Array, stiffness: Array, rest_length: Array) -> tuple[Array, Array]:
+    """Weight and slope for the derivative; a spring of no length is taken as k I."""
     weight = jnp.where(is_long, law.weight(squared, stiffness, rest_length), stiffness)
-    slope = jnp.where(is_long, law.slope(squared, stiffness, rest_length), zero)
-    return weight, slope, _inverse_length(squared)
+    slope = jnp.where(is_long, law.slope(squared, stiffness, rest_length), jnp.zeros((), squared.dtype))
+    return weight, slope
 
 
 def spring_block(
     law: Law, linearisation: Linearisation, d: Vector, stiffness: Array, rest_length: Array
 ) -> tuple[Array, Array | None, Vector]:
-    """Weight and slope [N/m] of each spring's block, and its direction (zero where it has no length)."""
-    weight, slope, inverse = _linearised(law, d.dot(d), stiffness, rest_length)
-    return *linearisation.block(jnp.broadcast_to(weight, d.shape), jnp.broadcast_to(slope, d.shape)), inverse * d
+    """Weight and slope [N/m] of each spring's block, and its direction. A spring of no length has the block k I and no direction."""
+    squared, is_long = _guarded(d)
+    weight, slope = _linearised(law, squared, is_long, stiffness, rest_length)
+    u = jnp.where(is_long, lax.rsqrt(squared), jnp.zeros_like(squared)) * d
+    return *linearisation.block(jnp.broadcast_to(weight, d.shape), jnp.broadcast_to(slope, d.shape)), u
 
 
 @eqx.filter_custom_jvp

@@ -9,12 +9,17 @@ reverse mode, and derivatives of derivatives are right too.
 from __future__ import annotations
 
 import abc
+from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jax import lax
 from jax.ad_checkpoint import checkpoint_name
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
 PyTree = Any
@@ -38,30 +43,65 @@ class ImplicitProblem(eqx.Module):
 def implicitly(problem: ImplicitProblem, theta: PyTree, solution: PyTree) -> PyTree:
     """`solution`, with the derivative by `theta` that the problem's equations give it."""
     found = jax.tree.map(lambda a: checkpoint_name(lax.stop_gradient(a), SOLUTION), solution)
-    return _implicit(problem, theta, found)
+    y_leaves, y_tree = jax.tree.flatten(found)
+    arrays, static = eqx.partition((problem, theta), eqx.is_array)
+    theta_leaves, theta_tree = jax.tree.flatten(arrays)
+
+    def tangent(which: tuple[int, ...], given: Sequence[Array], y: Sequence[Array], moved: Sequence[Array]) -> list[Array]:
+        """The tangent of y for tangents `moved` of the leaves `which` of theta."""
+        problem, theta = eqx.combine(jax.tree.unflatten(theta_tree, list(given)), static)
+        at = jax.tree.unflatten(y_tree, list(y))
+
+        def residual(*some: Array) -> PyTree:
+            full = list(given)
+            for i, value in zip(which, some, strict=True):
+                full[i] = value
+            problem, theta = eqx.combine(jax.tree.unflatten(theta_tree, full), static)
+            return problem.residual(theta, at)
+
+        _, change = jax.jvp(residual, [given[i] for i in which], list(moved))
+        return jax.tree.leaves(problem.solve_linearised(theta, at, jax.tree.map(lambda a: -a, change)))
+
+    out = _implicit.bind(*y_leaves, *theta_leaves, tangent=tangent, n=len(y_leaves))
+    return jax.tree.unflatten(y_tree, out)
 
 
-@eqx.filter_custom_jvp
-def _implicit(problem: ImplicitProblem, theta: PyTree, solution: PyTree) -> PyTree:
-    return solution
+# A primitive, because a scan drops the rule of a `jax.custom_jvp` when it is differentiated: second derivatives would be wrong.
+_implicit = Primitive("jaxspring_implicit")
+_implicit.multiple_results = True
 
 
-@_implicit.def_jvp
-def _implicit_jvp(primals: Any, tangents: Any) -> tuple[PyTree, PyTree]:
-    problem, theta, solution = primals
-    # Once more through the rule, so that a derivative of this derivative sees how y depends on theta.
-    y = _implicit(problem, theta, solution)
-    moves = jax.tree.map(lambda t: t is not None, tangents[1], is_leaf=lambda t: t is None)
-    moving, still = eqx.partition(theta, moves)
-    if not jax.tree.leaves(moving):
-        return y, jax.tree.map(_zeros, y)
-    moved = eqx.filter(tangents[1], moves)
-    _, change = jax.jvp(lambda some: problem.residual(eqx.combine(some, still), y), (moving,), (moved,))
-    return y, problem.solve_linearised(theta, y, jax.tree.map(lambda a: -a, change))
+def _values(*args: Array, tangent: Any, n: int) -> list[Array]:
+    return list(args[:n])
 
 
-def _zeros(a: Array) -> Array:
-    return a * 0
+def _jvp(primals: Any, tangents: Any, *, tangent: Any, n: int) -> tuple[Any, Any]:
+    # Once more through the primitive, so that a derivative of this derivative sees how y depends on theta.
+    y = _implicit.bind(*primals, tangent=tangent, n=n)
+    which = tuple(i for i, t in enumerate(tangents[n:]) if type(t) is not ad.Zero)
+    if not which:
+        return y, [ad.Zero.from_primal_value(a) for a in y]
+    return y, tangent(which, primals[n:], y, [tangents[n + i] for i in which])
+
+
+def _batch(args: Any, dims: Any, *, tangent: Any, n: int) -> tuple[Any, Any]:
+    (size,) = {a.shape[d] for a, d in zip(args, dims, strict=True) if d is not batching.not_mapped}
+    moved = [a if d is batching.not_mapped else jnp.moveaxis(a, d, 0) for a, d in zip(args, dims, strict=True)]
+    y = [jnp.broadcast_to(a, (size, *a.shape)) if d is batching.not_mapped else a for a, d in zip(moved[:n], dims[:n], strict=True)]
+    axes = [None if d is batching.not_mapped else 0 for d in dims[n:]]
+
+    def over_lanes(which: tuple[int, ...], given: Sequence[Array], y: Sequence[Array], moved: Sequence[Array]) -> list[Array]:
+        lane = partial(tangent, which)
+        return jax.vmap(lane, in_axes=(axes, 0, [axes[i] for i in which]))(list(given), list(y), list(moved))
+
+    return _implicit.bind(*y, *moved[n:], tangent=over_lanes, n=n), [0] * n
+
+
+_implicit.def_impl(_values)
+_implicit.def_abstract_eval(_values)
+ad.primitive_jvps[_implicit] = _jvp
+batching.primitive_batchers[_implicit] = _batch
+mlir.register_lowering(_implicit, mlir.lower_fun(_values, multiple_results=True))
 
 
 __all__ = ["SOLUTION", "ImplicitProblem", "implicitly"]

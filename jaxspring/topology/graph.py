@@ -1,7 +1,8 @@
 """Irregular networks: any list of springs between nodes.
 
-Nodes and springs are renumbered inside for locality; the user's numbering is kept outside. A node field has shape (N,), an edge
-field holds one entry of shape (E,). How pulls are summed on nodes is an object, `Gather` or `Scatter`: see `reduction.py`.
+Nodes and springs are renumbered inside, so that what is read together lies together; the user's numbering is kept outside. A node field
+has shape (N,), an edge field holds one entry of shape (E,). How pulls are summed on nodes is an object, `Gather` or `Scatter`: see
+`reduction.py`.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from .base import Topology
 from .edge_field import EdgeField
 from .lattice import _as_box, minimum_image
 from .permutation import Permutation
-from .reduction import Gather, Reduction, Scatter, choose_reduction
+from .reduction import Gather, Reduction, Scatter
 
 
 class Graph(Topology):
@@ -45,7 +46,7 @@ class Graph(Topology):
 
     @staticmethod
     def from_edges(
-        edges: Any, n_nodes: int, *, box: Any = None, triangles: Any = None, reduction: type[Gather] | type[Scatter] | None = None
+        edges: Any, n_nodes: int, *, box: Any = None, triangles: Any = None, reduction: type[Gather] | type[Scatter] = Gather
     ) -> Graph:
         """A network from an (E, 2) integer array: tail and head node of each spring. Springs may be repeated.
 
@@ -54,7 +55,7 @@ class Graph(Topology):
             n_nodes: number of nodes N; a node without a spring is allowed.
             box: (D,) period of each coordinate [m]; zero where a coordinate is not periodic.
             triangles: (T, 3) triangles, kept for plots and surfaces.
-            reduction: `Gather` (no scatter in any program) or `Scatter`; None chooses by size and platform.
+            reduction: `Gather` (no scatter in any program) or `Scatter`, which compiles sooner; see docs/benchmarks.md for their speed.
 
         Raises:
             ValueError: no node, a node that does not exist, a spring that joins a node to itself.
@@ -67,15 +68,17 @@ class Graph(Topology):
         if n_nodes < 1:
             raise ValueError(f"n_nodes = {n_nodes}, but a network needs at least 1 node.")
         pairs = node_indices("edges", edges, n_nodes)
-        nodes = Permutation(_locality_order(pairs, n_nodes))
-        inner = nodes.inverse[pairs]
+        near = _locality_order(pairs, n_nodes)
+        inner = np.argsort(near)[pairs]
         springs = Permutation(np.lexsort((inner.max(axis=1), inner.min(axis=1))))
-        tails, heads = (np.ascontiguousarray(column) for column in inner[springs.order].T)
-        kind = reduction or choose_reduction(n_nodes, len(pairs))
+        tails, heads = inner[springs.order].T
+        sums, order = reduction.build(tails, heads, n_nodes)
+        nodes = Permutation(near[order])
+        tails, heads = nodes.inverse[pairs[springs.order]].T
         return Graph(
             tails=jnp.asarray(tails),
             heads=jnp.asarray(heads),
-            reduction=kind.build(tails, heads, n_nodes),
+            reduction=sums,
             box=_as_box(box),
             triangles=None if triangles is None else np.asarray(triangles, np.int32),
             count=int(n_nodes),

@@ -1,9 +1,9 @@
 """Sums of spring values on the nodes of a graph, in two interchangeable ways.
 
-`Scatter` adds each spring's value to its two nodes. `Gather` lets each node read the values of its springs from a table, so that no
-program holds a scatter: bit-for-bit reproducible on every device. Nodes are bucketed by their number of springs, so that a table is
-never padded to the largest; a node with more than `WIDEST` springs is split into parts that are summed in a second round, so that a
-hub costs time and memory in proportion to its springs.
+`Gather`, the default, lets each node read the values of its springs from a table, so that no program holds a scatter: bit-for-bit
+reproducible on every device. `Scatter` adds each spring's value to its two nodes. Nodes are numbered and put in tables by their number of
+springs, so that no table is padded to the largest, and sums come out in the order of the nodes; a node with more than `WIDEST` springs
+is split into parts that are summed in a further round, so that a hub costs time and memory in proportion to its springs.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ from __future__ import annotations
 import abc
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
 from ..numerics import linear_call
 
-WIDEST = 16
+WIDEST = 16  # springs that a node reads in one row
+TABLE = 1000  # entries that are read in the time that one more table costs: with fewer tables small graphs are faster, and compile sooner
 
 
 class Reduction(eqx.Module):
@@ -47,9 +47,9 @@ class Scatter(Reduction):
     count: int = eqx.field(static=True)
 
     @staticmethod
-    def build(tails: np.ndarray, heads: np.ndarray, n_nodes: int) -> Scatter:
-        """Needs the number of nodes only."""
-        return Scatter(n_nodes)
+    def build(tails: np.ndarray, heads: np.ndarray, n_nodes: int) -> tuple[Scatter, np.ndarray]:
+        """As `Gather.build`; every order suits."""
+        return Scatter(n_nodes), np.arange(n_nodes)
 
     def difference(self, x: Array, tails: Array, heads: Array) -> Array:
         """Head minus tail."""
@@ -58,12 +58,12 @@ class Scatter(Reduction):
     def accumulate(self, p: Array, tails: Array, heads: Array) -> Array:
         """Plus at the tail, minus at the head."""
         zero = jnp.zeros(self.count, p.dtype)
-        return zero.at[tails].add(p, mode="promise_in_bounds").at[heads].add(-p, mode="promise_in_bounds")
+        return _add(_add(zero, tails, p), heads, -p)
 
     def sum_at_nodes(self, values: Array, tails: Array, heads: Array) -> Array:
         """Sum of the values of the springs at each node."""
         zero = jnp.zeros(self.count, values.dtype)
-        return zero.at[tails].add(values, mode="promise_in_bounds").at[heads].add(values, mode="promise_in_bounds")
+        return _add(_add(zero, tails, values), heads, values)
 
     def mean_of_ends(self, a: Array, tails: Array, heads: Array) -> Array:
         """Mean over both ends."""
@@ -73,32 +73,39 @@ class Scatter(Reduction):
 class Gather(Reduction):
     """Each node reads its springs from tables.
 
+    A table of shape (rows, width) lists, for each row, which values to add. In the first round the values are [values, -values, 0]; in
+    each further round they are the sums of the parts of the round before, and a zero.
+
     Attributes:
-        rounds: each round is a tuple of tables, one per width; a table of shape (rows, width) lists, for each row, which entries of
-            [values, -values, 0] (first round) or of the last round's rows to add.
-        order: (N,) which row of the last round belongs to each node.
-        rows: number of springs E.
+        whole: for each round, tables of several widths, one row for each node whose sum this round completes, in the order of the nodes.
+        parts: for each round but the last, one table, whose rows are parts of the nodes that need a further round.
     """
 
-    rounds: tuple[tuple[Int[Array, "rows width"], ...], ...]
-    order: Int[Array, " N"]
-    rows: int = eqx.field(static=True)
+    whole: tuple[tuple[Int[Array, "rows width"], ...], ...]
+    parts: tuple[Int[Array, "rows width"], ...]
 
     @staticmethod
-    def build(tails: np.ndarray, heads: np.ndarray, n_nodes: int) -> Gather:
-        """Tables from the springs' ends."""
-        n_springs = len(tails)
+    def build(tails: np.ndarray, heads: np.ndarray, n_nodes: int) -> tuple[Gather, np.ndarray]:
+        """Tables from the springs' ends, and the order that the nodes must be brought to: node `order[i]` becomes node i."""
         owner = np.concatenate([tails, heads]).astype(np.int64)
-        by_owner = np.argsort(owner, kind="stable")
-        entry, owner = by_owner, owner[by_owner]
-        padding = 2 * n_springs
-        rounds = []
-        while True:
-            tables, group_owner, row_of_group = _tables(entry, owner, n_nodes, padding)
-            rounds.append(tuple(jnp.asarray(t, jnp.int32) for t in tables))
-            if len(group_owner) == n_nodes:
-                return Gather(tuple(rounds), jnp.asarray(row_of_group[np.argsort(group_owner)], jnp.int32), n_springs)
-            entry, owner, padding = row_of_group, group_owner, len(group_owner)
+        entry = np.argsort(owner, kind="stable")
+        owner, nodes = owner[entry], np.arange(n_nodes)
+        whole, parts, completed = [], [], []
+        while len(nodes):
+            degree = np.bincount(owner, minlength=n_nodes)
+            start = np.cumsum(degree) - degree
+            is_whole = degree[nodes] <= WIDEST
+            small, nodes = nodes[is_whole], nodes[~is_whole]
+            width = _widths(degree[small])
+            whole.append(tuple(_table(entry, start[small[width == w]], degree[small[width == w]], w) for w in np.unique(width)))
+            completed.append(small[np.argsort(width, kind="stable")])
+            if len(nodes):
+                n_parts = -(-degree[nodes] // WIDEST)
+                owner = np.repeat(nodes, n_parts)
+                done = WIDEST * (np.arange(len(owner)) - np.repeat(np.cumsum(n_parts) - n_parts, n_parts))
+                parts.append(_table(entry, start[owner] + done, np.minimum(degree[owner] - done, WIDEST), WIDEST))
+                entry = np.arange(len(owner))
+        return Gather(tuple(whole), tuple(parts)), np.concatenate(completed)
 
     def difference(self, x: Array, tails: Array, heads: Array) -> Array:
         """Head minus tail."""
@@ -106,7 +113,7 @@ class Gather(Reduction):
 
     def accumulate(self, p: Array, tails: Array, heads: Array) -> Array:
         """Plus at the tail, minus at the head."""
-        return -linear_call(_minus_accumulate, _difference, (self, tails, heads), p)
+        return linear_call(_accumulate, _minus_difference, (self, tails, heads), p)
 
     def sum_at_nodes(self, values: Array, tails: Array, heads: Array) -> Array:
         """Sum of the values of the springs at each node."""
@@ -120,39 +127,33 @@ class Gather(Reduction):
         """(N,) sum of `tail_values` where a node is the tail and `head_values` where it is the head."""
         zero = jnp.zeros((1,), tail_values.dtype)
         values = jnp.concatenate([tail_values, head_values, zero])
-        for i, tables in enumerate(self.rounds):
-            sums = jnp.concatenate([_sum_rows(values, table) for table in tables])
-            values = sums if i + 1 == len(self.rounds) else jnp.concatenate([sums, zero])
-        return _read(values, self.order)
+        sums = [_sum_rows(values, table) for table in self.whole[0]]
+        for part, tables in zip(self.parts, self.whole[1:], strict=True):
+            values = jnp.concatenate([_sum_rows(values, part), zero])
+            sums += [_sum_rows(values, table) for table in tables]
+        return jnp.concatenate(sums)
 
 
-def choose_reduction(n_nodes: int, n_springs: int) -> type[Gather] | type[Scatter]:
-    """The faster of the two for this size on the default device, as `benchmarks/explicit.py` measures them."""
-    return Gather if jax.default_backend() != "cpu" else Scatter
+def _table(entry: np.ndarray, start: np.ndarray, count: np.ndarray, width: int) -> Array:
+    """Rows of `count` entries each from `start` on, padded to `width` by the number of the zero that follows all values."""
+    slot = np.arange(width)
+    at = np.where(slot < count[:, None], start[:, None] + slot, len(entry))
+    return jnp.asarray(np.append(entry, len(entry))[at], jnp.int32)
 
 
-def _tables(entry: np.ndarray, owner: np.ndarray, n_nodes: int, padding: int) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
-    """One round: tables by width, the node that each group of entries belongs to, and the row that each group got.
-
-    `entry` is sorted by `owner`. Every node has at least one group (empty where it has no spring).
-    """
-    degree = np.bincount(owner, minlength=n_nodes)
-    n_groups = np.maximum(-(-degree // WIDEST), 1)
-    group_owner = np.repeat(np.arange(n_nodes), n_groups)
-    first_group = np.cumsum(n_groups) - n_groups
-    place = np.arange(len(entry)) - np.repeat(np.cumsum(degree) - degree, degree)
-    group, slot = first_group[owner] + place // WIDEST, place % WIDEST
-    size = np.bincount(group, minlength=len(group_owner))
-    tables, row_of_group, start = [], np.empty(len(group_owner), np.int64), 0
-    for width in np.unique(np.maximum(size, 1)):
-        members = np.flatnonzero(np.maximum(size, 1) == width)
-        row_of_group[members] = start + np.arange(len(members))
-        table = np.full((len(members), width), padding, np.int64)
-        inside = np.maximum(size[group], 1) == width
-        table[row_of_group[group[inside]] - start, slot[inside]] = entry[inside]
-        tables.append(table)
-        start += len(members)
-    return tables, group_owner, row_of_group
+def _widths(degree: np.ndarray) -> np.ndarray:
+    """Width of each node's table, so that entries read, and `TABLE` for each table, are fewest. A node without a spring reads one zero."""
+    rows = np.bincount(np.maximum(degree, 1))
+    cost, narrower = np.zeros(len(rows)), np.zeros(len(rows), int)
+    for width in range(1, len(rows)):
+        # One table of this width for all nodes with more than s springs, after the best tables for up to s.
+        costs = [cost[s] + TABLE + width * rows[s + 1 : width + 1].sum() for s in range(width)]
+        narrower[width], cost[width] = np.argmin(costs), np.min(costs)
+    of_degree, width = np.zeros(len(rows), int), len(rows) - 1
+    while width > 0:
+        of_degree[narrower[width] + 1 : width + 1] = width
+        width = narrower[width]
+    return of_degree[np.maximum(degree, 1)]
 
 
 def _sum_rows(values: Array, table: Array) -> Array:
@@ -163,12 +164,27 @@ def _sum_rows(values: Array, table: Array) -> Array:
 
 
 def _read(a: Array, index: Array) -> Array:
-    return a.at[index].get(mode="promise_in_bounds")
+    # Every index is in range by construction; without the test for negative ones programs compile in half the time.
+    return a.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
+
+
+def _add(a: Array, index: Array, values: Array) -> Array:
+    return a.at[index].add(values, mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 def _difference(residuals, x):
     _, tails, heads = residuals
     return _read(x, heads) - _read(x, tails)
+
+
+def _minus_difference(residuals, x):
+    _, tails, heads = residuals
+    return _read(x, tails) - _read(x, heads)
+
+
+def _accumulate(residuals, p):
+    gather, _, _ = residuals
+    return gather.reduce(p, -p)
 
 
 def _minus_accumulate(residuals, p):

@@ -17,7 +17,7 @@ PAIR = np.array([[0.0, 0.0, 0.0], [1.5, 0.0, 0.0]])
 BOTH_WAYS = pytest.mark.parametrize("reduction", [js.Gather, js.Scatter])
 
 
-def pair_of_springs(stiffness, edges=((0, 1),), reduction=None):
+def pair_of_springs(stiffness, edges=((0, 1),), reduction=js.Gather):
     net = js.Graph.from_edges(edges, 2, reduction=reduction)
     return js.System(net, 1.0, js.Springs(net, stiffness, 1.0)), js.State.from_points(net, PAIR)
 

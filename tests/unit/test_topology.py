@@ -26,6 +26,7 @@ NETS = {
     "tube": lambda: js.lattice((5, 4), springs=js.STRUCTURAL + js.SHEAR, periodic=(True, False), box=(0.0, 5.0)),
     "gather": lambda: js.Graph.from_edges(random_edges(12, 30), 13, reduction=js.Gather),  # node 12 has no spring
     "scatter": lambda: js.Graph.from_edges(random_edges(12, 30), 13, reduction=js.Scatter),
+    "hub": lambda: js.Graph.from_edges([*random_edges(30, 90), *[(i % 29, 29) for i in range(40)]], 31),  # node 30 has no spring
     "star": lambda: js.Graph.from_edges([(0, i) for i in range(1, 300)], 300, reduction=js.Gather),
     "double": lambda: js.Graph.from_edges([(0, 1), (0, 1), (1, 0), (1, 2)], 3, reduction=js.Gather),
     "single": lambda: js.lattice((1, 3)),
@@ -188,6 +189,20 @@ def test_gather_and_scatter_agree():
     )
     for a, b in zip(gather, scatter, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-12)
+
+
+def test_tables_of_a_large_graph(rng):
+    """With several tables and a further round, sums are those of bincount; each node is summed once, only hubs in the further round."""
+    net = js.Graph.from_edges(random_edges(4000, 14_000), 4000)
+    tail, head = net.edges.T
+    degree = np.bincount(net.edges.ravel(), minlength=4000)
+    first, further = ([len(table) for table in tables] for tables in net.reduction.whole)
+    assert len(first) > 1
+    assert (sum(first), sum(further)) == (np.sum(degree <= 16), np.sum(degree > 16))
+    assert sum(further) > 0
+    p = rng.normal(size=net.n_springs)
+    got = jax.jit(lambda p: accumulate(net, p))(p)
+    np.testing.assert_allclose(got, np.bincount(tail, p, 4000) - np.bincount(head, p, 4000), atol=1e-13)
 
 
 @pytest.mark.parametrize("reduction", [js.Gather, js.Scatter])

@@ -17,7 +17,7 @@ import numpy as np
 import jaxspring as js
 
 from . import scenes
-from .measure import Case, arguments, measure, ratio_of_pairs, show, write
+from .measure import Case, Panel, arguments, draw, measure, ratio_of_pairs, show, write
 
 DT = np.float32(0.05)
 CHECKED_STEPS = 20
@@ -70,13 +70,11 @@ def lattices(sizes: list[tuple[int, int]], rounds: int) -> list[dict]:
 def graphs(sizes: list[tuple[int, int]], rounds: int) -> list[dict]:
     """One row per size: the library's default against both of its reductions and the bare scatter form."""
     rows = []
+    default = type(scenes.mesh(10)[0].net.reduction).__name__
     for n_nodes, n_steps in sizes:
-        chosen, state = scenes.mesh(n_nodes)
-        default = type(chosen.net.reduction).__name__
-        by_kind = {kind.__name__: scenes.mesh(n_nodes, reduction=kind)[0] for kind in (js.Gather, js.Scatter)}
-        k, l = (chosen.net.split(a).families[0] for a in (chosen.forces[0].stiffness, chosen.forces[0].rest_length))
-        cases = [Case("bare scatter", scenes.bare_graph(chosen.net, n_steps), (list(state.position), list(state.velocity), k, l, DT))]
-        cases += [Case(kind, *scenes.program(system, state, DT, n_steps)) for kind, system in by_kind.items()]
+        by_kind = {kind.__name__: scenes.mesh(n_nodes, reduction=kind) for kind in (js.Gather, js.Scatter)}
+        cases = [Case("bare scatter", *scenes.bare_mesh(*by_kind["Scatter"], DT, n_steps))]
+        cases += [Case(kind, *scenes.program(system, state, DT, n_steps)) for kind, (system, state) in by_kind.items()]
         timed = measure(cases, rounds)
         bare = timed["bare scatter"].run_s
         rows.append(
@@ -89,7 +87,7 @@ def graphs(sizes: list[tuple[int, int]], rounds: int) -> list[dict]:
                 "default_over_bare": timed[default].run_s / bare,
                 "compile_s": timed[default].compile_s,
                 "memory_mib": timed[default].temporary_mib,
-                "error": error(chosen, state),
+                "error": error(*by_kind[default]),
             }
         )
     return rows
@@ -109,23 +107,16 @@ def error(system: js.System, state: js.State) -> float:
 
 def picture(lattice_rows: list[dict], graph_rows: list[dict], path: Path) -> None:
     """Throughput against size."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9, 3.6), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    nodes = [row["n"] ** 2 for row in lattice_rows]
-    left.loglog(nodes, [row["rollout_M"] for row in lattice_rows], "o-", label="rollout, statuses on")
-    left.loglog(nodes, [row["bare_M"] for row in lattice_rows], "s--", label="bare scan, padded slices")
-    left.loglog(nodes, [row["rollout_M"] / row["over_edge_list"] for row in lattice_rows], "^:", label="edge list, stacked, scatter-add")
-    left.set(xlabel="nodes", ylabel="million node-steps / s", title="cloth, 6 spring families")
-    sizes = [row["nodes"] for row in graph_rows]
-    for name, style in (("Gather_M", "o-"), ("Scatter_M", "s--"), ("bare_M", "^:")):
-        right.loglog(sizes, [row[name] for row in graph_rows], style, label=name.removesuffix("_M").replace("bare", "bare scatter"))
-    right.set(xlabel="nodes", ylabel="million node-steps / s", title="Delaunay mesh")
-    for axes in (left, right):
-        axes.legend(fontsize=8)
-        axes.grid(alpha=0.3)
-    figure.savefig(path, dpi=150)
+    cells, nodes = [row["n"] ** 2 for row in lattice_rows], [row["nodes"] for row in graph_rows]
+    cloth = {
+        ("rollout, statuses on", "o-"): (cells, [row["rollout_M"] for row in lattice_rows]),
+        ("bare scan, padded slices", "s--"): (cells, [row["bare_M"] for row in lattice_rows]),
+        ("edge list, stacked, scatter-add", "^:"): (cells, [row["rollout_M"] / row["over_edge_list"] for row in lattice_rows]),
+    }
+    styles = {("Gather", "o-"): "Gather_M", ("Scatter", "s--"): "Scatter_M", ("bare scatter", "^:"): "bare_M"}
+    mesh = {style: (nodes, [row[name] for row in graph_rows]) for style, name in styles.items()}
+    speed = "million node-steps / s"
+    draw([Panel("cloth, 6 spring families", speed, cloth, log=True), Panel("Delaunay mesh", speed, mesh, log=True)], path)
 
 
 def main() -> None:

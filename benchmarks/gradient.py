@@ -18,7 +18,7 @@ import numpy as np
 import jaxspring as js
 
 from . import scenes
-from .measure import Case, arguments, measure, show, write
+from .measure import Case, Panel, arguments, draw, measure, show, write
 
 DT = np.float32(0.05)
 CHECKED_STEPS = 30
@@ -44,16 +44,13 @@ def lattices(sizes: list[tuple[int, int]], rounds: int) -> list[dict]:
 def graphs(sizes: list[tuple[int, int]], rounds: int) -> list[dict]:
     """One row per size: the default against both reductions and the autodiff of the bare scatter form."""
     rows = []
+    default = type(scenes.mesh(10)[0].net.reduction).__name__
     for n_nodes, n_steps in sizes:
-        system, state = scenes.mesh(n_nodes)
-        default = type(system.net.reduction).__name__
-        k, l = (system.net.split(a).families[0] for a in (system.forces[0].stiffness, system.forces[0].rest_length))
-        x, v = list(state.position), list(state.velocity)
-        bare = scenes.bare_graph(system.net, n_steps)
-        by_hand = jax.jit(jax.grad(lambda kl, x, v, dt, bare=bare: sum((a * a).sum() for a in bare(x, v, *kl, dt))))
-        cases = [Case("bare", bare, (x, v, k, l, DT)), Case("bare scatter, autodiff", by_hand, ((k, l), x, v, DT))]
-        for kind in (js.Gather, js.Scatter):
-            cases.append(Case(kind.__name__, *scenes.gradient_program(scenes.mesh(n_nodes, reduction=kind)[0], state, DT, n_steps)))
+        by_kind = {kind.__name__: scenes.mesh(n_nodes, reduction=kind) for kind in (js.Gather, js.Scatter)}
+        bare, arrays = scenes.bare_mesh(*by_kind["Scatter"], DT, n_steps)
+        by_hand = jax.jit(jax.grad(lambda x, v, k, l, dt, bare=bare: sum((a * a).sum() for a in bare(x, v, k, l, dt)), argnums=(2, 3)))
+        cases = [Case("bare", bare, arrays), Case("bare scatter, autodiff", by_hand, arrays)]
+        cases += [Case(kind, *scenes.gradient_program(system, state, DT, n_steps)) for kind, (system, state) in by_kind.items()]
         timed = measure(cases, rounds)
         rows.append(
             {
@@ -66,7 +63,7 @@ def graphs(sizes: list[tuple[int, int]], rounds: int) -> list[dict]:
                 "compile_s": timed[default].compile_s,
                 "temporary_mib": timed[default].temporary_mib,
                 "autodiff_mib": timed["bare scatter, autodiff"].temporary_mib,
-                "error": error(system, state),
+                "error": error(*by_kind[default]),
             }
         )
     return rows
@@ -97,23 +94,12 @@ def error(system: js.System, state: js.State) -> float:
 
 def picture(lattice_rows: list[dict], graph_rows: list[dict], path: Path) -> None:
     """Cost of the gradient against size."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9, 3.6), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    left.semilogx([row["n"] ** 2 for row in lattice_rows], [row["over_bare"] for row in lattice_rows], "o-", label="loss and gradient")
-    left.axhline(6, color="0.6", linestyle="--", label="bound: 6")
-    left.set(xlabel="nodes", ylabel="time / bare forward scan", title="cloth, 6 spring families", ylim=(0, None))
-    sizes = [row["nodes"] for row in graph_rows]
-    for name, style in (("Gather", "o-"), ("Scatter", "s--"), ("autodiff", "^:")):
-        right.semilogx(
-            sizes, [row[f"{name}_over_bare"] for row in graph_rows], style, label=name.replace("autodiff", "autodiff, bare scatter")
-        )
-    right.set(xlabel="nodes", ylabel="time / bare forward scan", title="Delaunay mesh", ylim=(0, None))
-    for axes in (left, right):
-        axes.legend(fontsize=8)
-        axes.grid(alpha=0.3)
-    figure.savefig(path, dpi=150)
+    cells, nodes = [row["n"] ** 2 for row in lattice_rows], [row["nodes"] for row in graph_rows]
+    cloth = {("loss and gradient", "o-"): (cells, [row["over_bare"] for row in lattice_rows])}
+    styles = {("Gather", "o-"): "Gather", ("Scatter", "s--"): "Scatter", ("autodiff, bare scatter", "^:"): "autodiff"}
+    mesh = {style: (nodes, [row[f"{name}_over_bare"] for row in graph_rows]) for style, name in styles.items()}
+    cost = "time / bare forward scan"
+    draw([Panel("cloth, 6 spring families", cost, cloth, bound=6), Panel("Delaunay mesh", cost, mesh)], path)
 
 
 def main() -> None:

@@ -9,15 +9,17 @@ from __future__ import annotations
 import argparse
 import json
 import platform
-import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
+
+from jaxspring.progress import Stopwatch
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -48,18 +50,16 @@ def measure(cases: list[Case], rounds: int = 9) -> dict[str, Row]:
     """Compile each case, then time them in interleaved rounds."""
     compiled, rows, times = {}, {}, {case.name: [] for case in cases}
     for case in cases:
-        start = time.perf_counter()
+        clock = Stopwatch()
         program = case.function.lower(*case.arguments).compile()
-        seconds = time.perf_counter() - start
+        seconds = clock.seconds
         memory = program.memory_analysis()
         compiled[case.name] = program
         rows[case.name] = Row(case.name, seconds, 0.0, 0.0, 0.0, memory.temp_size_in_bytes / 2**20)
         jax.block_until_ready(program(*case.arguments))
     for _ in range(rounds):
         for case in cases:
-            start = time.perf_counter()
-            jax.block_until_ready(compiled[case.name](*case.arguments))
-            times[case.name].append(time.perf_counter() - start)
+            times[case.name].append(_seconds(partial(compiled[case.name], *case.arguments)))
     for name, taken in times.items():
         rows[name].run_s = float(np.median(taken))
         rows[name].low_s, rows[name].high_s = (float(q) for q in np.quantile(taken, [0.1, 0.9]))
@@ -71,12 +71,15 @@ def ratio_of_pairs(case: Callable[[], Any], base: Callable[[], Any], pairs: int 
     ratios = []
     jax.block_until_ready((case(), base()))
     for _ in range(pairs):
-        start = time.perf_counter()
-        jax.block_until_ready(base())
-        middle = time.perf_counter()
-        jax.block_until_ready(case())
-        ratios.append((time.perf_counter() - middle) / (middle - start))
+        of_base = _seconds(base)
+        ratios.append(_seconds(case) / of_base)
     return float(np.median(ratios)), float(min(ratios)), float(max(ratios))
+
+
+def _seconds(run: Callable[[], Any]) -> float:
+    clock = Stopwatch()
+    jax.block_until_ready(run())
+    return clock.seconds
 
 
 def versions() -> dict[str, str]:
@@ -117,6 +120,41 @@ def show(title: str, rows: list[dict[str, Any]]) -> None:
     print("  " + "  ".join(c.rjust(w) for c, w in zip(columns, widths, strict=True)))
     for line in cells:
         print("  " + "  ".join(value.rjust(w) for value, w in zip(line, widths, strict=True)))
+
+
+@dataclass
+class Panel:
+    """One diagram of a picture: curves over the number of nodes.
+
+    Attributes:
+        title, ylabel: what it shows.
+        curves: label and style -> (nodes, values).
+        log: whether values have a logarithmic axis; else it starts at zero.
+        bound: a value to be stayed below, drawn as a line.
+    """
+
+    title: str
+    ylabel: str
+    curves: dict[tuple[str, str], tuple[list[float], list[float]]]
+    log: bool = False
+    bound: float | None = None
+
+
+def draw(panels: list[Panel], path: Path) -> None:
+    """Draw panels side by side."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(4.5 * len(panels), 3.6), layout="constrained")
+    for axes, panel in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
+        for (label, style), (nodes, values) in panel.curves.items():
+            axes.plot(nodes, values, style, label=label)
+        if panel.bound is not None:
+            axes.axhline(panel.bound, color="0.6", linestyle="--", label=f"bound: {panel.bound:g}")
+        axes.set(title=panel.title, xlabel="nodes", ylabel=panel.ylabel, xscale="log")
+        axes.set(yscale="log") if panel.log else axes.set(ylim=(0, None))
+        axes.legend(fontsize=8)
+        axes.grid(alpha=0.3)
+    figure.savefig(path, dpi=150)
 
 
 def arguments(doc: str | None) -> argparse.Namespace:

@@ -11,13 +11,13 @@ compilation included: images of one size share their compilation, so the first o
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 import jaxspring as js
+from jaxspring.progress import Stopwatch
 from jaxspring.scenes.reconstruction.fitting import SpringSettings, fit_springs
 
 from .measure import arguments, show, write
@@ -41,9 +41,9 @@ def images(quick: bool) -> Iterator[tuple[str, js.Image]]:
 
 def row(name: str, image: js.Image) -> dict:
     """One default job."""
-    start = time.perf_counter()
+    clock = Stopwatch()
     found = fit_springs(image)
-    seconds = time.perf_counter() - start
+    seconds = clock.seconds
     uniform, law, fitted = found.uniform, found.law.rmse, found.fitted.rmse
     return {
         "image": name,

@@ -24,7 +24,7 @@ def sheet(n: int, seed: int = 0) -> tuple[js.System, js.State]:
     return _hung(net, flat, rest, rng)
 
 
-def mesh(n_nodes: int, seed: int = 0, reduction: Any = None) -> tuple[js.System, js.State]:
+def mesh(n_nodes: int, seed: int = 0, reduction: Any = js.Gather) -> tuple[js.System, js.State]:
     """Random points in a square, joined by Delaunay's triangulation, in space, float32."""
     from scipy.spatial import Delaunay
 
@@ -127,9 +127,11 @@ def bare_edge_list(edges: np.ndarray, n_steps: int) -> Any:
     return jax.jit(run)
 
 
-def bare_graph(net: js.Graph, n_steps: int) -> Any:
-    """Component arrays on the graph's own order, gathers and scatter-add, unguarded."""
+def bare_mesh(system: js.System, state: js.State, dt: Any, n_steps: int) -> tuple[Any, tuple[Any, ...]]:
+    """Component arrays on the graph's own order, gathers and scatter-add, unguarded; and the arguments."""
+    net, springs = system.net, system.forces[0]
     tails, heads = net.tails, net.heads
+    k, l = (net.split(a).families[0] for a in (springs.stiffness, springs.rest_length))
 
     def run(x: Any, v: Any, k: Any, l: Any, dt: Any) -> Any:
         def step(carry: Any, _: None) -> Any:
@@ -142,7 +144,7 @@ def bare_graph(net: js.Graph, n_steps: int) -> Any:
 
         return lax.scan(step, (x, v), None, length=n_steps)[0][0]
 
-    return jax.jit(run)
+    return jax.jit(run), (list(state.position), list(state.velocity), k, l, dt)
 
 
 def numpy_positions(system: js.System, state: js.State, dt: float, n_steps: int) -> np.ndarray:

@@ -59,7 +59,7 @@ EXPLANATION = {
     Flag.INTERRUPTED: "interrupted; the result holds what was done until then",
     Flag.DT_LIMIT: "dt is above the stability limit of this stepper (see stable_dt)",
     Flag.PRECISION: "rounding of such large coordinates spoils the springs' forces; move the scene to the origin, or use float64",
-    Flag.SOLVER: "the solver gave up: its nonlinear solve did not converge, or its step shrank to the least allowed",
+    Flag.SOLVER: "the solver gave up: its solve did not reach the accuracy it needs, or its step shrank to the least allowed",
     Flag.INVALID: "a parameter has a value that its constructor would refuse (sign, NaN or infinity)",
 }
 
@@ -119,7 +119,7 @@ class Status(eqx.Module):
         )
 
     def only_if(self, condition: Array) -> Status:
-        """This status where `condition` holds, OK where it does not."""
+        """The status where `condition` holds, OK where it does not."""
         return jax.tree.map(lambda raised, ok: jnp.where(condition, raised, ok), self, Status.ok())
 
     @property

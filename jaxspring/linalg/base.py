@@ -19,7 +19,7 @@ class SolveInfo(eqx.Module):
     Attributes:
         residual: true residual |b - A x| / |b|; 0 where b is zero.
         iterations: how many there were, -1 where the solver does not tell.
-        status: OK, CG_MAXITER (the tolerance was not reached), CG_INDEFINITE, PIVOT or NONFINITE.
+        status: OK, CG_MAXITER (the tolerance was not reached), CG_INDEFINITE, PIVOT, SOLVER or NONFINITE.
     """
 
     residual: Array

@@ -80,7 +80,7 @@ def _jvp(primals: Any, tangents: Any, *, tangent: Any, n: int) -> tuple[Any, Any
     y = _implicit.bind(*primals, tangent=tangent, n=n)
     which = tuple(i for i, t in enumerate(tangents[n:]) if type(t) is not ad.Zero)
     if not which:
-        return y, [ad.Zero.from_primal_value(a) for a in y]
+        return y, [jnp.zeros_like(a) for a in y]
     return y, tangent(which, primals[n:], y, [tangents[n + i] for i in which])
 
 

@@ -34,12 +34,12 @@ class Newton(eqx.Module):
 
     Attributes:
         tolerance: wanted residual over the size of the forces; None is 1e-10 in float64 and 1e-5 in float32.
-        max_iter: most iterations.
+        max_iter: most iterations. Where springs are squeezed hard, the clamped tangent gains only a factor of two or so in each.
         max_halvings: most halvings of a step in the line search.
     """
 
     tolerance: float | None = eqx.field(static=True, default=None)
-    max_iter: int = eqx.field(static=True, default=30)
+    max_iter: int = eqx.field(static=True, default=100)
     max_halvings: int = eqx.field(static=True, default=20)
 
 
@@ -63,11 +63,13 @@ class NewtonStage(ImplicitProblem):
         solver: for the directions.
         adjoint: for derivatives, whose matrix is exact and may be indefinite.
         options: when to stop.
+        trust: 1 where the solution converged, else NaN, which its derivatives are multiplied by; None before it is known.
     """
 
     solver: LinearSolver
     adjoint: Any
     options: Newton
+    trust: Array | None = None
 
     def residual(self, stage: Stage, y: Vector) -> Vector:
         """M (y - v0) / h - f(x0 + h y, y, t) [N]."""
@@ -81,7 +83,8 @@ class NewtonStage(ImplicitProblem):
 
         state = jax.lax.stop_gradient(stage.reached(y))
         is_symmetric = stage.system.is_symmetric(state)
-        return self.adjoint.solve_exact(jacobian, right_side, stage.matrix(state, Tangent()), is_symmetric)
+        x = self.adjoint.solve_exact(jacobian, right_side, stage.matrix(state, Tangent()), is_symmetric)
+        return x if self.trust is None else self.trust * x
 
     def solve(self, stage: Stage, memory: Any) -> tuple[Vector, SolveInfo, Any]:
         """The stage's velocity with its derivative, how the solve ended, and what the solver carries on."""
@@ -103,7 +106,9 @@ class NewtonStage(ImplicitProblem):
         failed = end.status.then(Status.when(Flag.SOLVER, ~converged))
         status = jax.tree.map(lambda ok, bad: jnp.where(converged, ok, bad), Status.ok(), failed)
         relative = end.norm / jnp.where(scale > 0, scale, jnp.ones_like(scale))
-        return implicitly(self, stage, end.y), SolveInfo(relative, end.iterations, status), end.memory
+        trust = jnp.where(converged, jnp.ones_like(scale), jnp.full_like(scale, jnp.nan))
+        problem = NewtonStage(self.solver, self.adjoint, self.options, trust)
+        return implicitly(problem, stage, end.y), SolveInfo(relative, end.iterations, status), end.memory
 
     def _iterate(self, stage: Stage, merit: Any, at: _Progress) -> _Progress:
         matrix = stage.matrix(stage.reached(at.y), Tangent())

@@ -31,11 +31,10 @@ from ...rollouts import rollout
 from ...state import State
 from ...steppers.explicit import SymplecticEuler
 from ...vector import Vector
-from .fitting import LAW_RUN, LAW_UPDATES, Reconstructed
+from .fitting import Reconstructed, adapt, compare
 from .loss import Carried, Facts, SurfaceError, begin, mean_error
 from .pixels import Moments, best_height
 from .raster import locate
-from .report import measure, uniform_errors
 from .scene import Reconstruction
 from .triangles import count_folds
 
@@ -191,24 +190,15 @@ def fit_constants(
         raise ValueError(f"names = {tuple(names)}; expected some of {', '.join(NAMES)}.")
     settings = ConstantsSettings() if settings is None else settings
     loss, carried = prepare_constants(image, settings)
-    scene = loss.scene
     start = {name: getattr(loss.others, name) for name in names}
     adam = Adam(settings.learning_rate, decay_over=settings.n_iterations)
     found = fit(loss, start, adam, settings.n_iterations, on_iteration, carried, Positive(), None, checkpoint, resume, progress)
-    mesh = adapted(scene, loss.others.replaced(found.parameters))
-    error = SurfaceError(scene)
-    law, fitted = measure(error, adapted(scene, loss.others)), measure(error, mesh)
-    uniform, _, _ = uniform_errors(scene)
-    return Reconstructed(scene, uniform, law, fitted, carried.mass_of, mesh.mass_of, mesh, found, found.status)
+    law, mesh = (adapted(loss.scene, constants) for constants in (loss.others, loss.others.replaced(found.parameters)))
+    return compare(SurfaceError(loss.scene), law, mesh, found, found.status)
 
 
 def adapted(scene: Reconstruction, constants: Constants) -> Carried:
     """The mesh of the law with these constants, brought to rest in the plane."""
     rule = scene.law(constants.k_min, constants.k_max, constants.sigma)
-    stiffness, state = _adapt(scene, rule)
+    stiffness, state = adapt(scene, rule)
     return begin(scene, stiffness, state.position)
-
-
-@eqx.filter_jit
-def _adapt(scene: Reconstruction, rule: Any) -> tuple[Array, State]:
-    return scene.adapt(rule, LAW_RUN, LAW_UPDATES)

@@ -86,7 +86,7 @@ def prepare_springs(image: Image, settings: SpringSettings) -> tuple[SpringLoss,
     """The loss, and what its first evaluation starts from: the mesh of the slides' law. `loss.springs.zero()` are its variables."""
     scene = Reconstruction(image, settings.nodes)
     rule = scene.law(settings.k_min, settings.k_max, settings.sigma * scene.spacing)
-    stiffness, mesh = _adapt(scene, rule)
+    stiffness, mesh = adapt(scene, rule)
     loss = SpringLoss(SurfaceError(scene, settings.weight), StiffnessMap.around(scene.net, stiffness), settings.relaxation)
     return loss, begin(scene, stiffness, mesh.position)
 
@@ -115,13 +115,18 @@ def fit_springs(
     settings = SpringSettings() if settings is None else settings
     loss, carried = prepare_springs(image, settings)
     start = loss.springs.zero()
-    law = measure(loss.error, settle(loss, start, carried)[0])
+    law, _ = settle(loss, start, carried)
     optimiser = Adam(settings.learning_rate, settings.momentum, decay_over=settings.n_iterations)
     found = fit(loss, start, optimiser, settings.n_iterations, on_iteration, carried, None, None, checkpoint, resume, progress)
     mesh, status = settle(loss, found.parameters, found.best_carried)
-    uniform, _, _ = uniform_errors(loss.error.scene)
-    before, after = loss.springs.stiffness(start), loss.springs.stiffness(found.parameters)
-    return Reconstructed(loss.error.scene, uniform, law, measure(loss.error, mesh), before, after, mesh, found, status)
+    return compare(loss.error, law, mesh, found, status)
+
+
+def compare(error: SurfaceError, law: Carried, mesh: Carried, found: Fit, status: Status) -> Reconstructed:
+    """The result of a fit: the law's mesh and the fitted one, both at rest, measured alike beside the regular grid."""
+    uniform, _, _ = uniform_errors(error.scene)
+    surfaces = measure(error, law), measure(error, mesh)
+    return Reconstructed(error.scene, uniform, *surfaces, law.mass_of, mesh.mass_of, mesh, found, status)
 
 
 def settle(loss: SpringLoss, variables: Any, carried: Carried) -> tuple[Carried, Status]:
@@ -138,5 +143,6 @@ def _relax(scene: Reconstruction, stiffness: Any, carried: Carried) -> Any:
 
 
 @eqx.filter_jit
-def _adapt(scene: Reconstruction, rule: Any) -> tuple[Any, State]:
+def adapt(scene: Reconstruction, rule: Any) -> tuple[Any, State]:
+    """(E,) stiffness [N/m] and mesh of a law, brought to rest together in the plane."""
     return scene.adapt(rule, LAW_RUN, LAW_UPDATES)

@@ -87,8 +87,8 @@ def minimal_force(x, y, k, l):
         return existing(padded[1:] - padded[:-1])
 
     def existing(p):
-        place = lax.broadcasted_iota(np.int32, (N + 1,), 0)
-        return lax.select((place >= 1) & (place < N), p, jnp.zeros_like(p))
+        place = np.arange(N + 1)
+        return lax.select(jnp.asarray((place >= 1) & (place < N)), p, jnp.zeros_like(p))
 
     def on_nodes(p):
         p = existing(p)

@@ -57,6 +57,7 @@ _HOMES = {
     "linalg.cg": ("CG", "JaxCG"),
     "linalg.exact": ("ExactSolver",),
     "linalg.operators": ("Blocks", "NodeDyads", "SpringBlocks", "SpringMatrix"),
+    "linalg.multigrid": ("Multigrid",),
     "linalg.preconditioners": ("BlockJacobi", "Jacobi", "Preconditioner", "Unpreconditioned"),
     "linalg.envelope": ("Profile",),
     "linalg.ordering": ("Natural", "Ordering", "ReverseCuthillMcKee"),

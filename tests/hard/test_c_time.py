@@ -79,6 +79,7 @@ def test_c2_too_much_drag():
     assert traced(1e-3).has(Flag.DT_LIMIT)
     assert traced(1e-3).is_ok
     assert traced(6e-4).flags == 0  # 2 m / gamma = 0.667 ms
+    assert traced(-1e-3).has(Flag.DT_LIMIT)  # backward, too
     assert js.stable_dt(system, state) == pytest.approx(2 / 3000, rel=1e-14)
 
 

@@ -154,19 +154,47 @@ def test_fold_is_counted_and_the_walk_ends(scene):
     assert float(jnp.sum(doubled_areas(x, y, flip))) == pytest.approx(2 * float((grid.x[-1] - grid.x[0]) * (grid.y[-1] - grid.y[0])))
 
 
+def test_walk_that_goes_round_in_circles_is_stopped(scene, rng):
+    """In a mesh folded in many places some pixels walk for ever: after four times both sides of the mesh they are given up, and counted."""
+    grid, _, _, flip = scene
+    location = locate(*distorted(rng, grid, 1.5), flip, grid, locate_uniform(grid, flip.shape))
+    assert int(location.n_steps) == 4 * sum(NODES)
+    assert int(location.n_lost) > 0
+
+
+def test_triangle_without_area(scene):
+    """Two nodes in one place: their triangles count as folded; a pixel that one of them holds has a node's height, and a finite slope."""
+    grid, x, y, flip = scene
+    x, y = x.at[2, 3].set(x[2, 4]), y.at[2, 3].set(y[2, 4])
+    area = np.ravel(doubled_areas(x, y, flip))
+    n_flat = int(np.sum(area == 0))
+    assert n_flat > 0
+    assert int(count_folds(x, y, flip)) == np.sum(area < 0) + n_flat
+    held = jnp.full(grid.n_pixels, int(np.argmax(area == 0)), jnp.int32)
+    z = jnp.asarray(np.arange(x.size, dtype=float)).reshape(x.shape)
+    heights, slopes = jax.value_and_grad(lambda z: jnp.sum(draw(x, y, z, flip, grid, held)))(z)
+    assert float(heights) / grid.n_pixels in triangles_of(np.asarray(flip))[int(held[0])]
+    assert float(jnp.sum(slopes)) == grid.n_pixels
+
+
 def test_mesh_that_misses_the_image_is_reported(scene):
-    """Pixels outside the mesh are counted, not invented."""
+    """Pixels outside the mesh are counted, not invented; they stay in a triangle on the border, and the walk ends."""
     grid, x, y, flip = scene
     location = locate(x + 3.2, y, flip, grid, locate_uniform(grid, flip.shape))
     assert int(location.n_lost) >= 6 * grid.shape[0]
+    assert int(location.n_steps) <= sum(NODES)
+    lost = np.asarray(location.triangle)[np.asarray(grid.x) < float(x[0, 0]) + 3.2 - 1e-9]
+    assert len(lost) == int(location.n_lost)
+    assert np.all(np.any(np.asarray(neighbours(flip))[:, lost] == OUTSIDE, axis=0))
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_type_follows_the_image(rng, dtype):
-    """Float32 pixels are placed by float32 nodes, and none is lost though nodes sit on pixels."""
-    grid = PixelGrid.of(Image(rng.random((41, 61)).astype(dtype)))
+    """Float32 pixels are placed by float32 nodes, and none is lost though nodes and edges pass through pixels, up to rounding."""
+    grid = PixelGrid.of(Image(rng.random((41, 61)).astype(dtype), spacing=0.1, origin=0.3))
     x, y = grid.uniform_nodes((11, 16))
     flip = jnp.zeros((10, 15), bool)
     location = locate(x, y, flip, grid, locate_uniform(grid, flip.shape))
     assert x.dtype == dtype
     assert int(location.n_lost) == 0
+    assert int(location.n_steps) <= 3

@@ -38,8 +38,8 @@ def fit(rest):
 
 
 def test(rest):
-    """Run every test: unit tests, slow ones, docstring examples, notebooks."""
-    return run([PYTHON, "-m", "pytest", *rest], cwd=ROOT)
+    """Run every test: unit tests, slow ones, docstring examples, notebooks; on as many processes as there are cores, at most 4."""
+    return run([PYTHON, "-m", "pytest", "-n", "auto", "--maxprocesses", "4", "--dist", "worksteal", *rest], cwd=ROOT)
 
 
 def check(rest):

@@ -32,6 +32,11 @@ def test_e1_outside_is_clamped(rng, method, row):
     assert slope == 0
     assert jax.grad(lambda y: image.sample(3.0, y, method))(row) == 0
     assert image.outside(3.0, row)
+    turned = Image(image.values.T)
+    turned_value, turned_slope, _ = turned.sample_with_gradient(row, 3.0, method)
+    assert turned_value == pytest.approx(float(value), abs=1e-14)
+    assert turned_slope == 0
+    assert turned.outside(row, 3.0)
 
 
 def test_e1_the_border_itself_is_inside(rng):

@@ -7,6 +7,7 @@ import os
 import pickle
 import resource
 import signal
+import struct
 import subprocess
 import sys
 import time
@@ -160,6 +161,23 @@ def test_i3_absurd_files_are_refused_before_memory_is_taken(members, arguments, 
     """I3: what claims too much, or a path, is refused while less than 4 MiB were allocated."""
     path = tmp_path / "x"
     forge(path, members, **arguments)
+    refused_in_little_memory(path, words)
+
+
+def test_i3_a_directory_that_claims_more_than_the_file(tmp_path):
+    """I3: header and zip directory that agree on 1 GiB in a file of a few hundred bytes are refused in less than 4 MiB, too."""
+    path = tmp_path / "x"
+    small = npy(np.zeros(8, np.uint8))
+    forge(path, {"a": ("|u1", [1 << 30], small)})
+    data = bytearray(path.read_bytes())
+    directory, claimed = data.index(b"PK\1\2"), len(small) - 8 + (1 << 30)
+    data[directory + 20 : directory + 28] = struct.pack("<II", claimed, claimed)  # both sizes of its first entry
+    path.write_bytes(data)
+    refused_in_little_memory(path, "claim more than")
+
+
+def refused_in_little_memory(path, words):
+    """A CheckpointError that says so, before 4 MiB were allocated."""
     tracemalloc.start()
     try:
         with pytest.raises(CheckpointError, match=words):

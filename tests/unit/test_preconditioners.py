@@ -188,7 +188,7 @@ def test_springs_between_groups_are_those_of_the_triple_product(rng):
         return d.T @ (w[:, None] * d)
 
     expected = found.spread.T.toarray() @ laplacian(springs, weight) @ found.spread.toarray()
-    np.testing.assert_allclose(laplacian(found.springs, found.combination @ weight), expected, atol=1e-12)
+    np.testing.assert_allclose(laplacian(found.springs, found.combination @ weight).toarray(), expected, atol=1e-12)
 
 
 @pytest.mark.slow

@@ -88,7 +88,11 @@ def test_adaptation_is_smoothing_then_division_by_the_maximum():
     np.testing.assert_allclose(adaptation(Image(pixels), 1.5).values, expected / expected.max(), atol=1e-14)
 
 
-@pytest.mark.parametrize("observation", [GradientMagnitude(), Curvature(), Intensity(), lambda image: -image.values], ids=repr)
+@pytest.mark.parametrize(
+    "observation",
+    [GradientMagnitude(), Curvature(), Intensity(), lambda image: -image.values],
+    ids=["gradient", "curvature", "intensity", "user's own"],
+)
 def test_adaptation_lies_in_the_unit_interval(rng, dtype, observation):
     """Whatever is observed, a signed quantity or a function of one's own included, the result is an image within [0, 1] that reaches 1."""
     image = Image((rng.standard_normal((9, 10)) - 5).astype(dtype), spacing=2.0, origin=1.0)

@@ -66,6 +66,7 @@ _HOMES = {
     "steppers.explicit": ("ForwardEuler", "RungeKutta4", "SymplecticEuler", "VelocityVerlet"),
     "steppers.implicit": ("BDF2", "BackwardEuler", "ImplicitMidpoint"),
     "steppers.newton": ("Newton",),
+    "steppers.semi_implicit": ("SemiImplicit",),
     "steppers.stability": ("stable_dt",),
     "inverse.fit": ("Fit", "History", "Iteration", "fit"),
     "inverse.iteration": ("GradientWarning",),

@@ -8,6 +8,7 @@ from typing import Any
 import equinox as eqx
 from jaxtyping import Array
 
+from ..forces.base import Force
 from ..linalg.base import SolveInfo
 from ..state import State
 from ..system import System
@@ -31,6 +32,10 @@ class Stepper(eqx.Module):
     def report(self, memory: Any) -> SolveInfo | None:
         """How the linear or nonlinear solve of the last step ended; None for a stepper that solves nothing."""
         return None
+
+    def lags_damping(self, effect: Force, state: State) -> bool:
+        """Whether the damping of a force is taken at an old velocity, so that it counts in `limit`."""
+        return True
 
     def limit(self, squared_frequency: Array, damping: Array, damping_floor: Array) -> Array | None:
         """Largest stable dt [s] for motions of at most that squared frequency [1/s^2] and a damping rate c = gamma / m [1/s] within the

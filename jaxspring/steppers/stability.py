@@ -47,15 +47,16 @@ def stable_dt(system: System, state: State, stepper: Stepper | None = None) -> A
 
 def dt_limit(system: System, state: State, stepper: Stepper) -> Array | None:
     """As `stable_dt`, for a prepared system; None for a stepper that does not know its limit."""
-    return stepper.limit(*_bounds(system, state))
+    return stepper.limit(*_bounds(system, state, stepper))
 
 
-def _bounds(system: System, state: State) -> tuple[Array, Array, Array]:
-    """Squared frequency, damping rate and its floor, over the free nodes."""
+def _bounds(system: System, state: State, stepper: Stepper) -> tuple[Array, Array, Array]:
+    """Squared frequency, damping rate and its floor, over the free nodes; the damping as far as it is taken at an old velocity."""
+    lagged = [effect for effect in system.forces if stepper.lags_damping(effect, state)]
     inverse = 1 / system.mass.astype(state.dtype)
     stiffness = _total(state, (effect.stiffness_bound(state) for effect in system.forces))
-    damping = _total(state, (effect.damping_bound(state) for effect in system.forces))
-    floor = _total(state, (effect.damping_floor(state) for effect in system.forces))
+    damping = _total(state, (effect.damping_bound(state) for effect in lagged))
+    floor = _total(state, (effect.damping_floor(state) for effect in lagged))
     held = system.free_masks(state.dim)
     masks = [jnp.broadcast_to(m, state.position.shape) for m in held if m is not None]
     free = jnp.any(jnp.stack(masks), axis=0) if len(masks) == len(held) else None

@@ -30,7 +30,7 @@ def error(stepper, drag, n_steps):
 @pytest.mark.parametrize("drag", [0.0, 0.8])
 @pytest.mark.parametrize(
     ("stepper", "order"),
-    [(js.ForwardEuler(), 1), (js.SymplecticEuler(), 1), (js.VelocityVerlet(), 2), (js.RungeKutta4(), 4)],
+    [(js.ForwardEuler(), 1), (js.SymplecticEuler(), 1), (js.VelocityVerlet(), 2), (js.RungeKutta4(), 4), (js.SemiImplicit(), 1)],
     ids=lambda value: type(value).__name__ if isinstance(value, js.Stepper) else None,
 )
 def test_error_falls_as_dt_to_the_order(stepper, order, drag):

@@ -51,6 +51,7 @@ _HOMES = {
     "forces.springs": ("Springs", "StiffnessRule"),
     "forces.adaptive": ("ImageStiffness",),
     "forces.damping": ("Dashpots", "Drag"),
+    "forces.rayleigh": ("Rayleigh",),
     "forces.loads": ("Gravity", "Load"),
     "forces.data_springs": ("DataSprings", "ImageAttraction"),
     "linalg.base": ("LinearSolver", "SolveInfo"),

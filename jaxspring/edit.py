@@ -23,6 +23,8 @@ def replace(
     damping: Any = None,
     acceleration: Any = None,
     strength: Any = None,
+    mass_rate: Any = None,
+    stiffness_time: Any = None,
     k_min: Any = None,
     k_max: Any = None,
     sigma: Any = None,
@@ -42,6 +44,8 @@ def replace(
         damping: of `Dashpots` [N s/m].
         acceleration: of `Gravity` [m/s^2].
         strength: of `ImageAttraction` [J per unit of the image].
+        mass_rate: of `Rayleigh` [1/s].
+        stiffness_time: of `Rayleigh` [s].
         k_min: of `ImageStiffness` [N/m].
         k_max: of `ImageStiffness` [N/m].
         sigma: of `ImageStiffness`, in the image's unit of length. A number sets the width of the filter anew; a traced value keeps it.
@@ -57,8 +61,9 @@ def replace(
     >>> print(replace(system, stiffness=2.0, mass=3.0).forces[0].stiffness)
     2.0
     """
-    names = ("stiffness", "rest_length", "gamma", "damping", "acceleration", "strength", "k_min", "k_max", "sigma")
-    values = (stiffness, rest_length, gamma, damping, acceleration, strength, k_min, k_max, sigma)
+    names = ("stiffness", "rest_length", "gamma", "damping", "acceleration", "strength", "mass_rate", "stiffness_time")
+    values = (stiffness, rest_length, gamma, damping, acceleration, strength, mass_rate, stiffness_time)
+    names, values = (*names, "k_min", "k_max", "sigma"), (*values, k_min, k_max, sigma)
     changes: dict[int, dict[str, Any]] = {}
     for name, value in zip(names, values, strict=True):
         if value is not None:

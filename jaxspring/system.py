@@ -99,8 +99,8 @@ class System(eqx.Module):
         self.motion = motion
 
     def _cast(self, effect: Force, state: State) -> Force:
-        """The effect with its masses, and constants of the state's dtype: float32 in, float32 out, whatever the constants were."""
-        return cast_inexact(effect.with_mass(self.mass), state.dtype)
+        """The effect in its system, and constants of the state's dtype: float32 in, float32 out, whatever the constants were."""
+        return cast_inexact(effect.with_mass(self.mass).with_forces(self.forces), state.dtype)
 
     def _adopt(self, i: int, force: Any) -> Force:
         if not isinstance(force, Force):
@@ -112,7 +112,8 @@ class System(eqx.Module):
 
     def prepare(self, dtype: Any) -> System:
         """The system as a loop wants it: every constant in the shape of the topology and of `dtype`."""
-        forces = tuple(f.with_mass(self.mass).prepare(dtype) for f in self.forces)
+        ready = tuple(f.with_mass(self.mass).prepare(dtype) for f in self.forces)
+        forces = tuple(f.with_forces(ready) for f in ready)
         return cast_inexact(eqx.tree_at(lambda s: s.forces, self, forces), dtype)
 
     def force(self, state: State) -> Vector:

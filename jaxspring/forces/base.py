@@ -55,6 +55,10 @@ class Force(eqx.Module):
         """The force acting on these node masses [kg]; only forces that need them answer with another object."""
         return self
 
+    def with_forces(self, forces: tuple[Force, ...]) -> Force:
+        """The force knowing all forces of its system; only forces that need them answer with another object."""
+        return self
+
     def stiffness_blocks(self, state: State, linearisation: Linearisation) -> Blocks | None:
         """-dF/dx [N/m] as blocks of nodes and springs, for implicit steps; None: taken at the old time there."""
         return None

@@ -44,8 +44,8 @@ class Rayleigh(Force):
         ValueError: a negative or non-finite coefficient.
 
     >>> damping = Rayleigh.from_ratios((1.0, 0.05), (3.0, 0.05))
-    >>> print(damping.damping_ratio(3.0).round(4))
-    0.05
+    >>> print(f"{damping.damping_ratio(3.0):.3f}")
+    0.050
     """
 
     mass_rate: Array

@@ -63,6 +63,7 @@ _HOMES = {
     "linalg.envelope": ("Profile",),
     "linalg.ordering": ("Natural", "Ordering", "ReverseCuthillMcKee"),
     "linalg.skyline": ("Skyline", "SkylineFactor"),
+    "modes": ("Modes", "frequency_response", "normal_modes"),
     "steppers.base": ("Stepper",),
     "steppers.explicit": ("ForwardEuler", "RungeKutta4", "SymplecticEuler", "VelocityVerlet"),
     "steppers.implicit": ("BDF2", "BackwardEuler", "ImplicitMidpoint"),

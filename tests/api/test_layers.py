@@ -26,6 +26,7 @@ LAYERS = {
     "stability": 4,
     "steppers": 5,
     "equilibrium": 5,
+    "modes": 5,
     "watch": 6,  # watch, blocks and progress are the parts of a rollout
     "blocks": 6,
     "progress": 6,

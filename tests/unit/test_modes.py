@@ -44,7 +44,7 @@ def test_frequencies_of_a_chain():
 
 
 def test_a_stretched_body_against_scipy():
-    """Stretched, with one node and two coordinates held: the modes of SciPy's eigh of K and M, which are written from the springs."""
+    """Stretched, with a node and two coordinates held, and dampers: the modes of SciPy's eigh of K and M, written from the springs."""
     rng = np.random.default_rng(1)
     net, mass, k, l = js.Graph.from_edges(ISOSTATIC, 5), 1 + rng.random(5), 10 + rng.random(9), 0.8 * rng.random(9)
     free = np.ones((5, 3), bool)
@@ -52,7 +52,9 @@ def test_a_stretched_body_against_scipy():
     r = np.asarray(net.lengths(BODY))
     matrix = in_numpy(net, BODY, k * (1 - l / r), k * l / r, np.zeros(5)).toarray()[free.ravel()][:, free.ravel()]
     expected = scipy.linalg.eigh(matrix, np.diag(np.repeat(mass, 3)[free.ravel()]), eigvals_only=True)
-    found = js.normal_modes(js.System(net, mass, js.Springs(net, k, l), free=free), js.State.from_points(net, BODY))
+    # Dampers on moving nodes depend on the position; velocities are left out, and so are they.
+    moving = js.State.from_points(net, BODY, rng.normal(size=(5, 3)))
+    found = js.normal_modes(js.System(net, mass, (js.Springs(net, k, l), js.Dashpots(net, 3.0)), free=free), moving)
     np.testing.assert_allclose(found.squared_frequencies, expected, rtol=1e-12)
     shapes = np.asarray(found.shapes).reshape(10, 15)[:, free.ravel()]
     np.testing.assert_allclose(shapes @ matrix @ shapes.T, np.diag(expected), atol=1e-11)

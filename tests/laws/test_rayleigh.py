@@ -95,6 +95,7 @@ def test_turning_is_damped_where_springs_are_stretched_only(body, damping_force)
     np.testing.assert_allclose(f.sum(axis=0), 0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_squeezed_run_of_implicit_steps_loses_energy(body):
     """Implicit steps at ten times the explicit limit take it implicitly: the energy falls in every one, and pins do not move."""
     system, flat = body

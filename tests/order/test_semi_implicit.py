@@ -32,6 +32,7 @@ def dashpots(net, damping=0.7):
     return js.Dashpots(net, damping)
 
 
+@pytest.mark.slow
 def test_error_falls_as_dt():
     """Halving dt halves the distance from a fine Runge-Kutta run, on a nonlinear net with pins, drag and dashpots."""
     system, start = chain(drag, dashpots)
@@ -90,6 +91,7 @@ def test_damping_that_names_no_blocks_still_limits():
     assert js.stable_dt(system, start, js.SemiImplicit()) == js.stable_dt(system, start, js.SymplecticEuler())
 
 
+@pytest.mark.slow
 def test_one_step_with_dashpots_is_the_dense_solve():
     """(M + dt G) dv = dt f over the free coordinates by NumPy, G and f by derivatives of the force; held coordinates stay bit for bit."""
     system, start = chain(drag, dashpots)

@@ -61,6 +61,7 @@ def test_a_stretched_body_against_scipy():
     np.testing.assert_array_equal(found.shapes[:, ~free], 0)
 
 
+@pytest.mark.slow
 def test_a_free_body_has_its_rigid_motions():
     """A free net has 3 zero modes in the plane and 6 in space, and the others are above; no NaN among the frequencies."""
     net = js.Graph.from_edges(ISOSTATIC, 5)
@@ -101,6 +102,7 @@ def test_derivatives_of_frequencies_that_stand_alone():
     assert float(slope[1][1]) == pytest.approx(float(slope[0][2] - slope[0][0]) / 2e-4, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_derivatives_where_eigenvalues_coincide():
     """On a symmetric sheet derivatives are finite, those of a pair add up to the difference of its sum, and only its shapes have NaN."""
 

@@ -148,9 +148,14 @@ def stopped(tree: PyTree) -> PyTree:
     return jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_inexact_array(leaf) else leaf, tree)
 
 
+def tied(tree: PyTree) -> PyTree:
+    """`tree`, every leaf of which counts as varying where one does: JAX's linear solve cannot be transposed for part of a right side."""
+    return linear_call(lambda _, operand: operand, lambda _, cotangent: cotangent, (), tree)
+
+
 def is_traced(*trees: PyTree) -> bool:
     """Whether any leaf is a tracer: inside `jit`, `grad` or `vmap` of this value."""
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
 
 
-__all__ = ["Array", "cast_inexact", "is_traced", "linear_call", "stopped", "tiny"]
+__all__ = ["Array", "cast_inexact", "is_traced", "linear_call", "stopped", "tied", "tiny"]

@@ -39,6 +39,7 @@ class Flag(enum.IntFlag):
     INVALID = 16384
     PRECISION = 32768
     SOLVER = 65536
+    UNSTABLE = 131072
 
 
 WARNINGS = Flag.COINCIDENT | Flag.OVERLAP | Flag.OUTSIDE | Flag.DT_LIMIT | Flag.PRECISION
@@ -60,6 +61,7 @@ EXPLANATION = {
     Flag.DT_LIMIT: "dt is above the stability limit of this stepper (see stable_dt)",
     Flag.PRECISION: "rounding of such large coordinates spoils the springs' forces; move the scene to the origin, or use float64",
     Flag.SOLVER: "the solver gave up: its solve did not reach the accuracy it needs, or its step shrank to the least allowed",
+    Flag.UNSTABLE: "the forces balance, but the shape is no minimum of the energy: a small push makes it buckle; start from one",
     Flag.INVALID: "a parameter has a value that its constructor would refuse (sign, NaN or infinity)",
 }
 

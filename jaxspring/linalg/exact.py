@@ -7,16 +7,21 @@ gives NaN, never a half-converged derivative.
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.scipy.sparse.linalg import bicgstab
+from jaxtyping import Array
 
+from ..numerics import stopped
 from ..vector import Vector
 from .cg import CG
+from .implicit import ImplicitProblem
 from .operators import SpringMatrix
 
 Operator = Callable[[Vector], Vector]
@@ -75,4 +80,29 @@ class ExactSolver(eqx.Module):
         return jax.tree.map(lambda a: jnp.where(is_solved, a * scale, jnp.full_like(a, jnp.nan)), x)
 
 
-__all__ = ["ExactSolver"]
+class Converged(ImplicitProblem):
+    """Equations whose solution was found by an iteration that may have failed. Abstract.
+
+    Attributes:
+        adjoint: for derivatives, whose matrix is exact and may be indefinite.
+        trust: 1 where the solution converged, else NaN, which its derivatives are multiplied by; None before it is known.
+    """
+
+    adjoint: ExactSolver
+    trust: Array | None
+
+    @abc.abstractmethod
+    def nearby(self, theta: Any, y: Vector, /) -> tuple[SpringMatrix, bool]:
+        """A positive definite matrix close to the Jacobian, and whether the Jacobian is symmetric."""
+
+    def solve_linearised(self, theta: Any, y: Vector, right_side: Vector) -> Vector:
+        """(dr/dy)^-1 right_side, with the exact derivative."""
+
+        def jacobian(u: Vector) -> Vector:
+            return jax.jvp(lambda y: self.residual(theta, y), (y,), (u,))[1]
+
+        x = self.adjoint.solve_exact(jacobian, right_side, *self.nearby(theta, stopped(y)))
+        return x if self.trust is None else self.trust * x
+
+
+__all__ = ["Converged", "ExactSolver"]

@@ -22,6 +22,8 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
+from ..numerics import tied
+
 PyTree = Any
 
 # Reverse mode may keep what carries this name and compute the rest of a step again: the solve is then not repeated.
@@ -60,7 +62,7 @@ def implicitly(problem: ImplicitProblem, theta: PyTree, solution: PyTree) -> PyT
             return problem.residual(theta, at)
 
         _, change = jax.jvp(residual, [given[i] for i in which], list(moved))
-        return jax.tree.leaves(problem.solve_linearised(theta, at, jax.tree.map(lambda a: -a, change)))
+        return jax.tree.leaves(problem.solve_linearised(theta, at, tied(jax.tree.map(lambda a: -a, change))))
 
     out = _implicit.bind(*y_leaves, *theta_leaves, tangent=tangent, n=len(y_leaves))
     return jax.tree.unflatten(y_tree, out)

@@ -22,7 +22,7 @@ from jax import lax
 from jaxtyping import Array
 
 from .._checks import shape_of
-from ..numerics import stopped
+from ..numerics import stopped, tied
 from ..status import Flag, Status
 from ..vector import Vector
 from .base import LinearSolver, SolveInfo
@@ -110,7 +110,7 @@ class IterativeSolver(LinearSolver):
             x, info = self._guarded(operator, rhs, None, precondition, self.adjoint_tolerance or tolerance)
             return jax.tree.map(lambda a: jnp.where(info.status.is_ok, a, jnp.nan), x), info
 
-        return lax.custom_linear_solve(matvec, b, forward, backward, symmetric=True, has_aux=True)
+        return lax.custom_linear_solve(matvec, tied(b), forward, backward, symmetric=True, has_aux=True)
 
     def solve_in_step(self, matrix: SpringMatrix, b: Vector, guess: Vector | None, memory: Any) -> tuple[Vector, SolveInfo, Any]:
         """Solve with a `SpringMatrix`; held coordinates of x are those of b, exactly, and take no part in the iteration."""

@@ -126,7 +126,7 @@ class ImplicitStepper(Stepper):
         if self.newton is None:
             problem: Any = LinearStage(self.solver, self.stiffness)
         else:
-            problem = NewtonStage(self.solver, self.adjoint, self.newton)
+            problem = NewtonStage(self.adjoint, None, self.solver, self.newton)
         y, info, carried = problem.solve(stage, memory.solver)
         new = self.finish(state, dt, stage, y)
         energy = _closed_energy(system, new)

@@ -23,7 +23,10 @@ from jaxtyping import Array
 
 from ..forces.linearisation import Tangent
 from ..linalg.base import LinearSolver, SolveInfo
-from ..linalg.implicit import ImplicitProblem, implicitly
+from ..linalg.exact import Converged
+from ..linalg.implicit import implicitly
+from ..linalg.operators import SpringMatrix
+from ..numerics import stopped
 from ..status import Flag, Status
 from ..vector import Vector
 from .stage import Stage
@@ -56,35 +59,25 @@ class _Progress(eqx.Module):
     memory: Any
 
 
-class NewtonStage(ImplicitProblem):
+class NewtonStage(Converged):
     """The stage solved to convergence.
 
     Attributes:
         solver: for the directions.
-        adjoint: for derivatives, whose matrix is exact and may be indefinite.
         options: when to stop.
-        trust: 1 where the solution converged, else NaN, which its derivatives are multiplied by; None before it is known.
     """
 
     solver: LinearSolver
-    adjoint: Any
     options: Newton
-    trust: Array | None = None
 
     def residual(self, stage: Stage, y: Vector) -> Vector:
         """M (y - v0) / h - f(x0 + h y, y, t) [N]."""
         return stage.on_free(stage.inertia(y) - stage.system.force(stage.reached(y)), y)
 
-    def solve_linearised(self, stage: Stage, y: Vector, right_side: Vector) -> Vector:
-        """(dr/dy)^-1 right_side, with the exact derivative."""
-
-        def jacobian(u: Vector) -> Vector:
-            return jax.jvp(lambda y: self.residual(stage, y), (y,), (u,))[1]
-
-        state = jax.lax.stop_gradient(stage.reached(y))
-        is_symmetric = stage.system.is_symmetric(state)
-        x = self.adjoint.solve_exact(jacobian, right_side, stage.matrix(state, Tangent()), is_symmetric)
-        return x if self.trust is None else self.trust * x
+    def nearby(self, stage: Stage, y: Vector) -> tuple[SpringMatrix, bool]:
+        """The clamped matrix."""
+        state = stopped(stage.reached(y))
+        return stage.matrix(state, Tangent()), stage.system.is_symmetric(state)
 
     def solve(self, stage: Stage, memory: Any) -> tuple[Vector, SolveInfo, Any]:
         """The stage's velocity with its derivative, how the solve ended, and what the solver carries on."""
@@ -107,7 +100,7 @@ class NewtonStage(ImplicitProblem):
         status = jax.tree.map(lambda ok, bad: jnp.where(converged, ok, bad), Status.ok(), failed)
         relative = end.norm / jnp.where(scale > 0, scale, jnp.ones_like(scale))
         trust = jnp.where(converged, jnp.ones_like(scale), jnp.full_like(scale, jnp.nan))
-        problem = NewtonStage(self.solver, self.adjoint, self.options, trust)
+        problem = NewtonStage(self.adjoint, trust, self.solver, self.options)
         return implicitly(problem, stage, end.y), SolveInfo(relative, end.iterations, status), end.memory
 
     def _iterate(self, stage: Stage, merit: Any, at: _Progress) -> _Progress:
@@ -156,9 +149,9 @@ class NewtonStage(ImplicitProblem):
         return potential
 
     def _scale(self, stage: Stage) -> Array:
-        """Size of the forces [N], each effect by itself, so that a balance of large forces is not taken for their absence."""
+        """Size of the forces where free [N], each effect by itself, so that a balance of large forces is not taken for their absence."""
         at = stage.predictor
-        sizes = [_norm(force.force(at)) for force in stage.system.forces]
+        sizes = [_norm(stage.system.hold(force.force(at))) for force in stage.system.forces]
         inertia = _norm((stage.system.mass.astype(stage.h.dtype) / stage.h) * stage.velocity)
         return sum(sizes, start=inertia)
 

@@ -112,24 +112,25 @@ def test_c20_a_pin_moved_by_a_schedule(stepper):
 
 @pytest.mark.slow
 def test_d4_loose_solves_and_failed_ones():
-    """The gradient's error is at most ten times the tolerance of the solves; where they fail, the status says so and it is NaN."""
-    net = js.lattice(16)
-    points = np.stack([np.arange(16.0), 0.1 * np.random.default_rng(4).normal(size=16)], axis=1)
-    start = js.State.from_points(net, points)
-    system = js.System(net, 0.01, js.Springs(net, 1e4, 1.0), free=np.arange(16) > 0)
+    """Loose adjoint solves: an error of at most ten times their tolerance (0.3 measured). Loose forward solves move the path itself, ten
+    steps of it: at most a hundred times (37 measured). Failed solves: the status says so, and the gradient is NaN.
+    """
+    system, start, _ = cloth(8, gravity=9.81)
 
     def gradient(solver):
         def of(k):
-            run = js.rollout(js.replace(system, stiffness=k), start, js.BackwardEuler(solver), 20 * LIMIT, 4)
-            return jnp.sum(run.state.position.y), run.status
+            run = js.rollout(js.replace(system, stiffness=k), start, js.BackwardEuler(solver), 20 * LIMIT, 10)
+            return jnp.sum(run.state.position.z), run.status
 
         return jax.jit(jax.grad(of, has_aux=True))(1e4)
 
     exact, _ = gradient(js.CG(tolerance=1e-13))
     for tolerance in (1e-3, 1e-6):
-        loose, status = gradient(js.CG(tolerance=tolerance))
+        loose, status = gradient(js.CG(tolerance=1e-13, adjoint_tolerance=tolerance))
         assert abs(float(loose / exact) - 1) <= 10 * tolerance
         assert bool(status.is_ok)
+        looser, _ = gradient(js.CG(tolerance=tolerance))
+        assert abs(float(looser / exact) - 1) <= 100 * tolerance
     failed, status = gradient(js.CG(tolerance=1e-13, max_iter=3))
     assert bool(status.has(Flag.CG_MAXITER))
     assert np.isnan(float(failed))

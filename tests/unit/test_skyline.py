@@ -46,7 +46,7 @@ both_kinds = pytest.mark.parametrize("scalar", [False, True], ids=["blocks", "sc
 
 
 @both_kinds
-@pytest.mark.parametrize("shape", [(2, 2), (9, 8), *(pytest.param(s, marks=pytest.mark.slow) for s in ((16, 16), (33, 32), (64, 64)))])
+@pytest.mark.parametrize("shape", [(2, 2), (6, 7), pytest.param((64, 64), marks=pytest.mark.slow)])
 def test_residual_on_lattices(rng, shape, scalar):
     """A step 100 times the explicit limit, structural + shear + bend: residual below 1e-12 up to 64 per side, and it is told truly."""
     net = js.lattice(shape, FAMILIES)
@@ -60,8 +60,8 @@ def test_residual_on_lattices(rng, shape, scalar):
 
 @pytest.mark.slow
 def test_residual_on_a_delaunay_graph(rng):
-    """On 5,000 random points joined by Delaunay's triangulation, the residual is below 1e-12, and the solution is SuperLU's."""
-    points = np.c_[rng.random((5000, 2)) * 70, 0.1 * rng.standard_normal(5000)]
+    """On 2,000 random points joined by Delaunay's triangulation, the residual is below 1e-12, and the solution is SuperLU's."""
+    points = np.c_[rng.random((2000, 2)) * 45, 0.1 * rng.standard_normal(2000)]
     net = js.delaunay(points[:, :2])
     step, b = stiff_step(net, points, rng), random_vector(net, rng)
     x, info, _ = solve(Skyline(net), step.matrix, b)
@@ -73,17 +73,16 @@ def test_residual_on_a_delaunay_graph(rng):
 @both_kinds
 def test_agrees_with_scipys_banded_solver(rng, scalar):
     """The solution equals scipy.linalg.solveh_banded of the same matrix."""
-    net = js.lattice((12, 10), FAMILIES)
+    net = js.lattice((6, 7), FAMILIES)
     step, b = stiff_step(net, near_grid(net, rng), rng, scalar=scalar), random_vector(net, rng)
     lower = scipy.sparse.tril(step.sparse).tocoo()
     banded = np.zeros((int((lower.row - lower.col).max()) + 1, lower.shape[0]))
     banded[lower.row - lower.col, lower.col] = lower.data
-    x = Skyline(net).factor(step.matrix).solve(b)
+    x, _, _ = solve(Skyline(net), step.matrix, b)
     assert error(net, x, scipy.linalg.solveh_banded(banded, flat(net, b), lower=True)) < 1e-11
 
 
-@pytest.mark.parametrize("dim", [1, 2, 3])
-@both_kinds
+@pytest.mark.parametrize(("dim", "scalar"), [(1, False), (2, False), (3, False), (3, True)], ids=["1", "2", "3", "3 scalar"])
 def test_agrees_with_numpy_in_every_dimension(rng, dim, scalar):
     """One, two and three coordinates, on a graph of several pieces and nodes without a spring: numpy.linalg.solve."""
     pairs = rng.integers(0, 14, (24, 2))
@@ -103,7 +102,7 @@ def test_agrees_with_numpy_in_every_dimension(rng, dim, scalar):
         (js.lattice(1), 3),
         (js.lattice(2), 2),
         (js.lattice(40, js.STRUCTURAL + js.BEND), 3),
-        (js.lattice((3, 3, 4), FAMILIES + js.BODY), 3),
+        (js.lattice((3, 3, 4), js.STRUCTURAL + js.BODY), 3),
         (js.lattice((5, 6), js.STRUCTURAL, periodic=(False, True), box=[6.0, 0.0]), 2),
     ],
     ids=["point", "point in space", "pair", "chain", "block", "wrapped"],
@@ -116,7 +115,7 @@ def test_agrees_with_numpy_on_every_lattice(rng, net, dim):
 
 
 @pytest.mark.parametrize(
-    ("order", "block"), [(Natural(), 1), (ReverseCuthillMcKee(), 7), (Natural(), 33), (np.random.default_rng(3).permutation(42), 500)]
+    ("order", "block"), [(Natural(), 1), (ReverseCuthillMcKee(), 7), (np.random.default_rng(3).permutation(42), 500)], ids=["1", "7", "500"]
 )
 def test_order_and_panels_change_the_work_only(sheet, block, order):
     """Any order of elimination and any size of panel give the same solution."""
@@ -128,7 +127,7 @@ def test_order_and_panels_change_the_work_only(sheet, block, order):
 def test_factor_is_the_dense_cholesky_factor(sheet):
     """What is stored within the envelope is numpy.linalg.cholesky of the permuted dense matrix, entry for entry."""
     net, step, _ = sheet
-    skyline = Skyline(net, block=9)
+    skyline = Skyline(net, order=ReverseCuthillMcKee(), block=7)
     order = skyline.envelope.order.order
     unknowns = (order[:, None] * 3 + np.arange(3)).ravel()
     dense = np.linalg.cholesky(step.dense[np.ix_(unknowns, unknowns)])
@@ -154,17 +153,25 @@ def test_only_coupled_coordinates_are_factored_together(rng):
     """Springs in the plane couple x and y; z, which has scalar springs, gets a scalar factor; a dyad at every node couples all."""
     net = js.lattice((6, 5), FAMILIES)
     points, b = near_grid(net, rng), random_vector(net, rng)
-    flat_blocks, _ = spring_blocks(net, points, 1 + rng.random(net.n_springs), rng.random(net.n_springs), (0, 1))
-    upward, like = spring_blocks(net, points, rng.random(net.n_springs), None, (2,))
-    diagonal = js.Vector(tuple(net.node_field(0.1 + rng.random(30)) for _ in range(3)))
+    weight, slope, upright = 1 + rng.random(net.n_springs), rng.random(net.n_springs), rng.random(net.n_springs)
+    mass, tilt = 0.1 + rng.random((30, 3)), rng.random(30)
+    flat_blocks, _ = spring_blocks(net, points, weight, slope, (0, 1))
+    upward, like = spring_blocks(net, points, upright, None, (2,))
+    diagonal = js.Vector(tuple(net.node_field(mass[:, i]) for i in range(3)))
     matrix = SpringMatrix(Blocks((diagonal,), (), (flat_blocks, upward)), (None,) * 3, like, net.layout)
     assert alike_coordinates(matrix) == (((0, 1),), ((2,),))
-    tilted = eqx.tree_at(lambda m: m.blocks.dyads, matrix, (NodeDyads(net.node_field(rng.random(30)), like),))
+    tilted = eqx.tree_at(lambda m: m.blocks.dyads, matrix, (NodeDyads(net.node_field(tilt), like),))
     assert alike_coordinates(tilted) == (((0, 1, 2),),)
-    for case, n_kinds in ((matrix, 2), (tilted, 1)):
+    dense, node = np.zeros((30, 3, 30, 3)), np.arange(30)
+    dense[:, :2, :, :2] = in_numpy(net, points[:, :2], weight, slope, np.zeros(30)).toarray().reshape(30, 2, 30, 2)
+    dense[:, 2, :, 2] = in_numpy(net, points[:, :1], upright, 0 * upright, np.zeros(30)).toarray()
+    dense[node, :, node, :] += mass[:, :, None] * np.eye(3)
+    dense_tilted = dense.copy()
+    dense_tilted[node, :, node, :] += tilt[:, None, None] * points[:, :, None] * points[:, None, :]
+    for case, expected, n_kinds in ((matrix, dense, 2), (tilted, dense_tilted, 1)):
         factor = Skyline(net).factor(case)
         assert [panels.shape[0] for panels in factor.panels] == [1] * n_kinds
-        assert error(net, factor.solve(b), np.linalg.solve(np.asarray(jax.jit(SpringMatrix.to_dense)(case)), flat(net, b))) < 1e-11
+        assert error(net, factor.solve(b), np.linalg.solve(expected.reshape(90, 90), flat(net, b))) < 1e-11
 
 
 def test_coordinates_with_the_same_springs_share(rng):
@@ -265,10 +272,11 @@ def test_the_second_of_two_factors_may_fail(rng):
 @both_kinds
 def test_a_singular_matrix_is_never_silent(rng, scalar):
     """A free net without masses has no solution: PIVOT, or SOLVER where rounding left a positive pivot; never OK."""
-    net = js.lattice((8, 9), FAMILIES)
+    net = js.lattice((6, 7), FAMILIES)
+    nothing = js.Vector((jnp.zeros((6, 7)),) * 3)
     for _ in range(4):
         step, b = stiff_step(net, near_grid(net, rng), rng, scalar=scalar), random_vector(net, rng)
-        free = eqx.tree_at(lambda m: m.blocks.diagonal, step.matrix, ())
+        free = eqx.tree_at(lambda m: m.blocks.diagonal, step.matrix, (nothing,))
         _, info, _ = solve(Skyline(net), free, b)
         assert bool(info.status.has(Flag.PIVOT | Flag.SOLVER))
         assert not bool(info.status.is_ok)
@@ -278,11 +286,15 @@ def test_a_singular_matrix_is_never_silent(rng, scalar):
 def test_numbers_that_are_not_finite(sheet, value):
     """NaN or infinity in the matrix is NONFINITE at its node; in the right-hand side, NONFINITE."""
     net, step, b = sheet
-    spoiled = step.plus(net, np.where(np.arange(42)[:, None] == 16, [0.0, value, 0.0], 0.0))
-    _, info, _ = solve(Skyline(net), spoiled.matrix, b)
+    (mass,) = step.matrix.blocks.diagonal
+    at_node = jnp.asarray(np.where(np.arange(42).reshape(6, 7) == 16, value, mass.y))
+    spoiled = eqx.tree_at(lambda m: m.blocks.diagonal, step.matrix, (js.Vector((mass.x, at_node, mass.z)),))
+    _, info, _ = solve(Skyline(net), spoiled, b)
     assert Flag(int(info.status.flags)) == Flag.NONFINITE
     assert int(info.status.node) == 16
-    x, info, _ = solve(Skyline(net), step.matrix, js.Vector((b.x.at[0, 0].set(value), b.y, b.z)))
+    x, info, _ = solve(
+        Skyline(net), step.matrix, js.Vector((jnp.asarray(np.where(np.arange(42).reshape(6, 7) == 0, value, b.x)), b.y, b.z))
+    )
     assert Flag(int(info.status.flags)) == Flag.NONFINITE
     assert not np.all(np.isfinite(flat(net, x)))
 
@@ -307,8 +319,7 @@ def test_memory_is_kept_while_the_matrix_stands(sheet):
     np.testing.assert_array_equal(flat(net, x), flat(net, again))
 
 
-@pytest.mark.parametrize("growth", [0.0, 0.01])
-def test_memory_is_carried_through_a_scan(sheet, growth):
+def test_memory_is_carried_through_a_scan(sheet):
     """Twenty steps of x <- A^-1 x in a scan equal twenty dense solves, whether the matrix stands or changes at every step."""
     net, step, b = sheet
     skyline = Skyline(net)
@@ -326,12 +337,13 @@ def test_memory_is_carried_through_a_scan(sheet, growth):
         (x, _), ok = jax.lax.scan(advance, (b, begin), jnp.arange(20.0))
         return x, ok
 
-    x, ok = run(step.matrix, b, growth)
-    expected = flat(net, b)
-    for i in range(20):
-        expected = np.linalg.solve(step.dense + growth * i * np.eye(126), expected)
-    assert error(net, x, expected) < 1e-10
-    assert bool(jnp.all(ok))
+    for growth in (0.0, 0.01):
+        x, ok = run(step.matrix, b, growth)
+        expected = flat(net, b)
+        for i in range(20):
+            expected = np.linalg.solve(step.dense + growth * i * np.eye(126), expected)
+        assert error(net, x, expected) < 1e-10
+        assert np.all(ok)
 
 
 def test_memory_of_another_kind_of_matrix_is_refused(rng):
@@ -359,7 +371,7 @@ def test_float32_stays_float32(rng):
 
 def test_as_users_run_it(user_mode, rng):
     """Under JAX's own defaults, not jitted, without memory."""
-    net = js.lattice((5, 5), FAMILIES)
+    net = js.lattice((3, 4), js.STRUCTURAL)
     step, b = stiff_step(net, near_grid(net, rng), rng, dtype=np.float32), random_vector(net, rng, dtype=np.float32)
     x, info, _ = Skyline(net).solve_in_step(step.matrix, b, None, None)
     assert residual(net, step.sparse, x, b) < 1e-3
@@ -381,7 +393,7 @@ def test_many_right_hand_sides(sheet, rng):
     """`vmap` over right-hand sides with one factor gives what one after the other gives."""
     net, step, _ = sheet
     several = jax.tree.map(lambda *a: jnp.stack(a), *[random_vector(net, rng) for _ in range(5)])
-    factor = Skyline(net).factor(step.matrix)
+    factor = Skyline(net, order=ReverseCuthillMcKee(), block=7).factor(step.matrix)
     together = jax.vmap(factor.solve)(several)
     for i in range(5):
         one = factor.solve(jax.tree.map(lambda a, i=i: a[i], several))

@@ -31,6 +31,7 @@ class Scene:
         start: the first state.
         t1: time of the end [s].
         explicit, implicit: numbers of steps, for explicit steppers and for those that solve.
+        without_derivative: methods whose derivative is left out, to spare its compilation.
     """
 
     name: str
@@ -42,6 +43,7 @@ class Scene:
     t1: float
     explicit: tuple[int, ...]
     implicit: tuple[int, ...]
+    without_derivative: tuple[str, ...] = ()
 
     def loss(self, position: js.Vector) -> jax.Array:
         """Mean square displacement of the nodes [m^2]."""
@@ -125,4 +127,5 @@ def mesh(n: int = 11) -> Scene:
         32.0,
         (16, 32, 64, 256, 1024),
         (16, 64, 256),
+        ("ForwardEuler", "SemiImplicit", "BackwardEuler, Newton", "ImplicitMidpoint", "BDF2", "diffrax Kvaerno5"),
     )

@@ -4,12 +4,13 @@
 
 A hanging chain, a stiff pinned cloth, the reconstruction mesh (`accuracy_scenes.py`), float64. Every stepper here over a range of dt,
 and diffrax over tolerances. One compilation serves every dt of a method: a loop over `rollout`s of 16 steps, each resuming the one
-before, which costs little over one `rollout` of all steps (`loop_over_rollout`). Read: `error` is the root mean square error of the last
+before; `loop_over_rollout` is its time over that of one `rollout` of all steps. Read: `error` is the root mean square error of the last
 positions over that of the displacement, against diffrax Dopri8 at a relative and absolute tolerance of 1e-12; RungeKutta4 at its smallest
 dt checks that reference. `gradient_error` is the relative error of the derivative of the mean square displacement by one constant
-(stiffness; k_max on the mesh), in forward mode by jax.jvp through the run. Runs longer than `LONG` are timed once and get no derivative;
-the quick look has none at all. `run_s` is the median of three, after compilation, and blocks. A run is `unstable` where its status is an
-error or where it has moved more than twice as far as the reference; it stays in the table, and is a cross at the picture's top.
+(stiffness; k_max on the mesh), in forward mode by jax.jvp through the run. Runs longer than `LONG` are timed once and get no derivative,
+nor do those methods on the mesh that `without_derivative` names, to spare their compilation; the quick look has none at all. `run_s` is
+the median of three, after compilation, and blocks. A run is `unstable` where its status is an error or where it has moved more than
+twice as far as the reference; it stays in the table, and is a cross at the picture's top.
 """
 
 from __future__ import annotations
@@ -51,6 +52,7 @@ STEPPERS: dict[str, tuple[Any, int]] = {
     "BDF2": (js.BDF2(), 2),
 }
 IS_EXPLICIT = ("ForwardEuler", "SymplecticEuler", "VelocityVerlet", "RungeKutta4", "SemiImplicit")
+COLORS = ("C0", "C1", "C2", "C3", "C4", "C5", "C6", "C9", "C8", "black", "navy", "darkgreen")
 SOLVERS: dict[str, tuple[Any, tuple[float, ...]]] = {
     "Tsit5": (diffrax.Tsit5(), (1e-2, 1e-4, 1e-6, 1e-8, 1e-10)),
     "Dopri8": (diffrax.Dopri8(), (1e-2, 1e-4, 1e-6, 1e-8, 1e-10)),
@@ -191,14 +193,14 @@ def picture(scene: Scene, rows: list[dict], path: Path) -> None:
         of = [row for row in rows if row["method"] == name]
         is_adaptive = name.startswith("diffrax")
         kind = "-" if name in IS_EXPLICIT else ":" if is_adaptive else "--"
-        marker = "os^vDsP*Xos^"[i]
+        marker, color = "os^vDsP*Xos^"[i], COLORS[i]
         for axes, x in ((left, [row["run_s"] for row in of]), (right, [scene.t1 / row["steps"] for row in of])):
             if axes is right and is_adaptive:
                 continue
             good = [(a, row["error"]) for a, row in zip(x, of, strict=True) if not row["unstable"]]
-            axes.loglog(*zip(*good, strict=True) if good else ([], []), kind + marker, color=f"C{i % 10}", ms=4, lw=1, label=name)
+            axes.loglog(*zip(*good, strict=True) if good else ([], []), kind + marker, color=color, ms=4, lw=1, label=name)
             bad = [a for a, row in zip(x, of, strict=True) if row["unstable"]]
-            axes.plot(bad, [2.0 * 1.25 ** (i % 6) for _ in bad], "x", color=f"C{i % 10}", ms=6)
+            axes.plot(bad, [2.0 * 1.25 ** (i % 6) for _ in bad], "x", color=color, ms=6)
     dts = np.array([scene.t1 / scene.explicit[-1], scene.t1 / min(scene.implicit)])
     for order, at in ((1, 0.5), (2, 0.5), (4, 0.5)):
         right.plot(dts, at * (dts / dts[1]) ** order, color="0.75", lw=0.8, zorder=0)
@@ -218,7 +220,10 @@ def one_scene(scene: Scene, quick: bool) -> dict[str, Any]:
     clock = Stopwatch()
     expected = reference(scene)
     print(f"{scene.name:6s} reference {clock.seconds:.1f} s", flush=True)
-    rows = [row for method in methods(scene, quick) for row in rows_of(scene, method, expected, not quick)]
+    settings, rows = {"block": BLOCK, "dtype": "float64", "t1": scene.t1, "quick": quick}, []
+    for method in methods(scene, quick):
+        rows += rows_of(scene, method, expected, not quick and method.name not in scene.without_derivative)
+        write(f"work_precision_{scene.name}", settings, {"rows": rows})  # what is done is kept where the rest is interrupted
     finest = [row for row in rows if row["method"] == "RungeKutta4"][-1]
     check = {
         "reference": f"Dopri8 at {REFERENCE:g}",
@@ -229,9 +234,7 @@ def one_scene(scene: Scene, quick: bool) -> dict[str, Any]:
     }
     show(scene.title, rows)
     show("reference", [check])
-    path = write(
-        f"work_precision_{scene.name}", {"block": BLOCK, "dtype": "float64", "t1": scene.t1, "quick": quick}, {"rows": rows, **check}
-    )
+    path = write(f"work_precision_{scene.name}", settings, {"rows": rows, **check})
     picture(scene, rows, path.with_suffix(".png"))
     return check
 

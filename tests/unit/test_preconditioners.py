@@ -40,6 +40,16 @@ def as_dense(preconditioner, matrix):
     return jax.lax.map(column, jnp.eye(n * dim, dtype=matrix.like.dtype).reshape(n * dim, n, dim)).T
 
 
+@eqx.filter_jit
+def applied(preconditioner, matrix, r):
+    """The map, of one vector."""
+    return preconditioner.build(matrix)(r)
+
+
+to_dense = eqx.filter_jit(SpringMatrix.to_dense)
+factors_of = eqx.filter_jit(BlockFactors.of)
+
+
 def lattice_case(rng, shape=(12, 13), **options):
     """A lattice and a stiff matrix on it."""
     net = js.lattice(shape, FAMILIES if len(shape) > 1 else js.STRUCTURAL + js.BEND)
@@ -57,7 +67,7 @@ def squeezed(net, step):
     springs = step.matrix.blocks.springs[0]
     pushing = eqx.tree_at(lambda s: s.weight, springs, springs.weight - 2.0 * springs.slope)
     matrix = eqx.tree_at(lambda m: m.blocks.springs, step.matrix, (pushing,))
-    return Step(matrix, scipy.sparse.csr_array(np.asarray(matrix.to_dense())))
+    return Step(matrix, scipy.sparse.csr_array(np.asarray(to_dense(matrix))))
 
 
 cases = pytest.mark.parametrize("case", [lattice_case, graph_case], ids=["lattice", "graph"])
@@ -88,10 +98,10 @@ def test_jacobi_divides_by_the_diagonal_and_blocks_solve_with_them(rng):
     mask[5] = False
     step = step.holding(net, mask, None, None)
     b = random_vector(net, rng)
-    np.testing.assert_allclose(flat(net, Jacobi().build(step.matrix)(b)), flat(net, b) / np.diag(step.dense), rtol=1e-13)
+    np.testing.assert_allclose(flat(net, applied(Jacobi(), step.matrix, b)), flat(net, b) / np.diag(step.dense), rtol=1e-13)
     blocks = [step.dense[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] for i in range(12)]
     expected = np.concatenate([np.linalg.solve(block, r) for block, r in zip(blocks, flat(net, b).reshape(12, 3), strict=True)])
-    np.testing.assert_allclose(flat(net, BlockJacobi().build(step.matrix)(b)), expected, rtol=1e-12)
+    np.testing.assert_allclose(flat(net, applied(BlockJacobi(), step.matrix, b)), expected, rtol=1e-12)
     assert Unpreconditioned().build(step.matrix)(b) is b
 
 
@@ -103,7 +113,7 @@ def test_block_factors_are_numpys_inverse_without_overflow(rng, dtype, dim, size
     blocks = (size * root @ root.transpose(0, 2, 1)).astype(dtype)
     r = rng.standard_normal((7, dim)).astype(dtype)
     rows = tuple(js.Vector(tuple(jnp.asarray(blocks[:, i, j]) for j in range(dim))) for i in range(dim))
-    x = BlockFactors.of(rows).solve(js.Vector(tuple(jnp.asarray(r[:, i]) for i in range(dim))))
+    x = eqx.filter_jit(BlockFactors.solve)(factors_of(rows), js.Vector(tuple(jnp.asarray(r[:, i]) for i in range(dim))))
     expected = np.linalg.solve(blocks.astype(float), r.astype(float)[:, :, None])[:, :, 0]
     scale = np.abs(expected).max()
     np.testing.assert_allclose(np.stack(list(x), -1) / scale, expected / scale, rtol=0, atol=1e-3 if dtype == np.float32 else 1e-11)
@@ -114,7 +124,7 @@ def test_singular_and_negative_blocks_get_finite_positive_pivots():
     blocks = [np.diag([2.0, 3.0, 0.0]), np.zeros((3, 3)), np.diag([-1.0, 2.0, 3.0]), np.ones((3, 3))]
     entries = np.stack(blocks)
     rows = tuple(js.Vector(tuple(jnp.asarray(entries[:, i, j]) for j in range(3))) for i in range(3))
-    factors = BlockFactors.of(rows)
+    factors = factors_of(rows)
     assert all(np.isfinite(p).all() and (np.asarray(p) > 0).all() for p in factors.inverse_pivots)
 
 
@@ -136,13 +146,14 @@ def test_interpolation_is_linear_and_restriction_its_transpose(rng, shape, perio
     wraps = periodic if isinstance(periodic, tuple) else (bool(periodic),) * len(shape)
     axes = Axes(shape, wraps)
     below = axes.coarser()
-    np.testing.assert_allclose(prolong(jnp.ones(below.shape), axes), np.ones(shape))
+    up, down = jax.jit(lambda v: prolong(v, axes)), jax.jit(lambda r: restrict(r, axes))
+    np.testing.assert_allclose(up(np.ones(below.shape)), np.ones(shape))
     for axis, wrap in enumerate(wraps):
         if not wrap and shape[axis] > 1:
             line = 2.0 * np.indices(below.shape)[axis]
-            np.testing.assert_allclose(prolong(jnp.asarray(line), axes), np.indices(shape)[axis])
+            np.testing.assert_allclose(up(line), np.indices(shape)[axis])
     v, r = rng.standard_normal(below.shape), rng.standard_normal(shape)
-    assert np.vdot(prolong(jnp.asarray(v), axes), r) == pytest.approx(np.vdot(v, restrict(jnp.asarray(r), axes)), rel=1e-12)
+    assert np.vdot(up(v), r) == pytest.approx(np.vdot(v, down(r)), rel=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -160,7 +171,7 @@ def test_a_linear_displacement_has_the_same_energy_on_the_coarser_lattice(rng, s
         root = rng.standard_normal((2, 2, *cells))
         blocks.append(jnp.asarray(root + root.swapaxes(0, 1)))
     fine = LatticeSprings(axes, tuple(offsets), tuple(blocks), jnp.zeros((2, 2, *shape)))
-    coarse = fine.coarser(axes.coarser())
+    coarse = eqx.filter_jit(lambda springs: springs.coarser(axes.coarser()))(fine)
     gradient = rng.standard_normal((2, len(shape)))
 
     def energy(springs, spacing):
@@ -201,10 +212,14 @@ def test_the_finest_level_multiplies_like_the_matrix(rng, case):
     dyad = NodeDyads(jnp.ones(net.node_shape), matrix.like)
     matrix = SpringMatrix(matrix.blocks + Blocks(dyads=(dyad,)), matrix.free, matrix.like, matrix.layout)
     hierarchy = Multigrid(net).hierarchy
-    levels, _ = hierarchy.build(matrix, jnp.float64)
-    v = matrix.pick(random_vector(net, rng), js.Vector.zeros_like(matrix.like))
-    got = hierarchy.leave(levels[0].product(hierarchy.enter(v)), v)
-    expected = matrix(v)
+
+    @eqx.filter_jit
+    def products(matrix, v):
+        levels, _ = hierarchy.build(matrix, jnp.float64)
+        v = matrix.pick(v, js.Vector.zeros_like(matrix.like))
+        return hierarchy.leave(levels[0].product(hierarchy.enter(v)), v), matrix(v)
+
+    got, expected = products(matrix, random_vector(net, rng))
     np.testing.assert_allclose(flat(net, got), flat(net, expected), atol=1e-5 * np.abs(flat(net, expected)).max())
 
 
@@ -214,7 +229,7 @@ def test_springs_of_another_net_add_to_the_nodes_alone(rng):
     wrapping = js.lattice((12, 13), periodic=True, box=(13.0, 12.0, 0.0))
     more, _ = spring_blocks(wrapping, np.zeros((156, 3)), np.ones(wrapping.n_springs))
     matrix = SpringMatrix(Blocks(springs=(more,)), (None,) * 3, step.matrix.like, net.layout)
-    ((level,), _) = Multigrid(net).hierarchy.build(matrix, jnp.float64)
+    (level,) = eqx.filter_jit(lambda matrix: Multigrid(net).hierarchy.build(matrix, jnp.float64)[0])(matrix)
     np.testing.assert_array_equal(level.centre[0, 0], np.full((12, 13), 4.0))
     assert level.families == ()
 
@@ -222,8 +237,8 @@ def test_springs_of_another_net_add_to_the_nodes_alone(rng):
 ODD = [
     ("chain", lambda: js.lattice(300, js.STRUCTURAL + js.BEND), 2, 20),
     ("thin", lambda: js.lattice((2, 150), js.STRUCTURAL + js.SHEAR), 3, 20),
-    ("block", lambda: js.lattice((8, 7, 9), js.STRUCTURAL + js.SHEAR + js.BODY), 3, 15),
-    ("wrapped", lambda: js.lattice((24, 20), FAMILIES, periodic=True, box=(20.0, 24.0, 0.0)), 3, 15),
+    ("block", lambda: js.lattice((8, 7, 9), js.STRUCTURAL + js.BODY), 3, 15),
+    ("wrapped", lambda: js.lattice((24, 20), js.STRUCTURAL + js.SHEAR, periodic=True, box=(20.0, 24.0, 0.0)), 3, 15),
     ("wrapped, odd", lambda: js.lattice((15, 15), FAMILIES, periodic=(True, False), box=(0.0, 15.0, 0.0)), 3, 20),
     ("small", lambda: js.lattice((3, 3)), 3, 10),
     ("one node", lambda: js.lattice((1, 1)), 3, 10),
@@ -269,9 +284,7 @@ def graph_iterations(n, rng):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("iterations", "sizes"), [(cloth_iterations, (32, 128)), (graph_iterations, (2000, 16000))], ids=["cloth", "graph"]
-)
+@pytest.mark.parametrize(("iterations", "sizes"), [(cloth_iterations, (16, 64)), (graph_iterations, (1000, 8000))], ids=["cloth", "graph"])
 def test_iterations_do_not_grow_with_the_mesh(rng, iterations, sizes):
     """Less than 1.5 times as many on the larger mesh (block-Jacobi: about three times)."""
     few, many = (iterations(n, rng) for n in sizes)
@@ -287,12 +300,14 @@ def test_multigrid_under_vmap_and_in_float32(rng, case):
     solver, b = CG(preconditioner=Multigrid(net)), random_vector(net, rng)
     factors = jnp.asarray([1.0, 3.0])
 
-    def scaled(factor):
-        return eqx.tree_at(lambda m: m.blocks, step.matrix, step.matrix.blocks.scaled(factor))
+    def solution(matrix, factor):
+        scaled = eqx.tree_at(lambda m: m.blocks, matrix, matrix.blocks.scaled(factor))
+        return solver.solve_in_step(scaled, b, None, None)[0]
 
-    x, _ = jax.vmap(lambda f: solver.solve_in_step(scaled(f), b, None, None)[:2])(factors)
+    x = eqx.filter_jit(eqx.filter_vmap(solution, in_axes=(None, 0)))(step.matrix, factors)
+    single = eqx.filter_jit(solution)
     for lane, factor in enumerate(factors):
-        alone, _ = solve(solver, scaled(factor), b)
+        alone = single(step.matrix, factor)
         np.testing.assert_allclose(x.x[lane], alone.x, atol=1e-6 * np.abs(alone.x).max())
     net, step = case(rng, dtype=np.float32)
     _, info = solve(CG(preconditioner=Multigrid(net)), step.matrix, random_vector(net, rng, dtype=np.float32))

@@ -9,8 +9,8 @@ positions over that of the displacement, against diffrax Dopri8 at a relative an
 dt checks that reference. `gradient_error` is the relative error of the derivative of the mean square displacement by one constant
 (stiffness; k_max on the mesh), in forward mode by jax.jvp through the run. Runs longer than `LONG` are timed once and get no derivative,
 nor do those methods on the mesh that `without_derivative` names, to spare their compilation; the quick look has none at all. `run_s` is
-the median of three, after compilation, and blocks. A run is `unstable` where its status is an error or where it has moved more than
-twice as far as the reference; it stays in the table, and is a cross at the picture's top.
+the median of three, after compilation, and blocks. A run is `unstable` where its status is an error or where it has moved more than 2.5
+times as far as the reference; it stays in the table, and is a cross at the picture's top.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from .measure import show, write
 
 BLOCK = 16  # steps of one rollout in the loop
 LONG = 2.0  # seconds
-FARTHEST = 2.0  # displacement over that of the reference
+FARTHEST = 2.5  # displacement over that of the reference; a slow chain at its lowest has 2.2 times that of one on its way up
 REFERENCE = 1e-12
 SCENES = {"chain": accuracy_scenes.chain, "cloth": accuracy_scenes.cloth, "mesh": accuracy_scenes.mesh}
 STEPPERS: dict[str, tuple[Any, int]] = {

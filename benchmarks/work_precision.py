@@ -8,7 +8,7 @@ before; `loop_over_rollout` is its time over that of one `rollout` of all steps.
 positions over that of the displacement, against diffrax Dopri8 at a relative and absolute tolerance of 1e-12; RungeKutta4 at its smallest
 dt checks that reference. `gradient_error` is the relative error of the derivative of the mean square displacement by one constant
 (stiffness; k_max on the mesh), in forward mode by jax.jvp through the run. Runs longer than `LONG` are timed once and get no derivative,
-nor do those methods on the mesh that `without_derivative` names, to spare their compilation; the quick look has none at all. `run_s` is
+nor do those methods that `Scene.without_derivative` names, to spare their compilation; the quick look has none at all. `run_s` is
 the median of three, after compilation, and blocks. A run is `unstable` where its status is an error or where it has moved more than 2.5
 times as far as the reference; it stays in the table, and is a cross at the picture's top.
 """
@@ -88,9 +88,10 @@ def with_stepper(scene: Scene, stepper: Any, constant: Any, setting: Any) -> tup
 def with_diffrax(scene: Scene, solver: Any, constant: Any, setting: Any) -> tuple[js.Vector, jax.Array, jax.Array]:
     """Adaptive steps; setting is the relative and absolute tolerance."""
     controller = diffrax.PIDController(rtol=setting, atol=setting)
+    most = scene.most_kvaerno if isinstance(solver, diffrax.Kvaerno5) else 200_000
     adjoint = diffrax.ForwardMode()
     result = js.diffeqsolve(
-        scene.system(constant), scene.start, scene.t1, solver, stepsize_controller=controller, adjoint=adjoint, max_steps=200_000
+        scene.system(constant), scene.start, scene.t1, solver, stepsize_controller=controller, adjoint=adjoint, max_steps=most
     )
     return result.state.position, result.status.flags, result.info.n_steps
 

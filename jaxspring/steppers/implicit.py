@@ -26,6 +26,7 @@ from ..forces.linearisation import Linearisation, Tangent
 from ..linalg.base import LinearSolver, SolveInfo
 from ..linalg.cg import JaxCG
 from ..linalg.exact import ExactSolver
+from ..linalg.iterative import norm
 from ..numerics import stopped
 from ..state import State
 from ..status import NOWHERE, Flag, Status
@@ -130,14 +131,14 @@ class ImplicitStepper(Stepper):
         y, info, carried = problem.solve(stage, memory.solver)
         new = self.finish(state, dt, stage, y)
         energy = _closed_energy(system, new)
-        status = _breakdown(stage, new).then(info.status).then(self._energy_status(memory.energy, energy))
+        status = _breakdown(stage, new).then(info.status).then(self._energy_status(memory.energy, energy, stage, new))
         return new, Memory(carried, SolveInfo(info.residual, info.iterations, status), self.remember(state), energy)
 
     def report(self, memory: Memory) -> SolveInfo:
         """How the last solve ended."""
         return memory.info
 
-    def _energy_status(self, old: Energy | None, new: Energy | None) -> Status:
+    def _energy_status(self, old: Energy | None, new: Energy | None, stage: Stage, after: State) -> Status:
         """ENERGY_ROSE, where nothing in the system can feed energy in."""
         if old is None or new is None:
             return Status.ok()
@@ -147,8 +148,11 @@ class ImplicitStepper(Stepper):
         rise = sum((b - a for a, b in pairs), start=jnp.zeros((), dtype))
         exchanged = sum((jnp.abs(b - a) for a, b in pairs), start=jnp.zeros((), dtype))
         size = sum((jnp.abs(a) for a, _ in pairs), start=jnp.zeros((), dtype))
-        rounding = 64 * float(jnp.finfo(dtype).eps)
-        return Status.when(Flag.ENERGY_ROSE, rise > self.energy_slack(dtype) * exchanged + rounding * size)
+        # Of the energies themselves, and of the positions, which stiff springs feel.
+        rounding = 64 * float(jnp.finfo(dtype).eps) * size
+        still, end = stopped((stage, after.position))
+        rounding = rounding + still.rounding() * norm(end - still.predictor.position)
+        return Status.when(Flag.ENERGY_ROSE, rise > self.energy_slack(dtype) * exchanged + rounding)
 
 
 class BackwardEuler(ImplicitStepper):

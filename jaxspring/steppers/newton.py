@@ -2,11 +2,12 @@
 
     Phi(y) = sum M (y - v0)^2 / 2 + sum over forces of their potential at x0 + h y        grad Phi = h r(y)
 
-    A d = -r,   A = M/h + G + h K clamped positive semi-definite        a direction in which Phi falls
-    y <- y + a d,   a = 1, 1/2, 1/4, ...                                until Phi falls enough
+    A d = -r         A exact; where it shows a curvature that is not positive, A = M/h + G + h K clamped: Phi falls along d
+    y <- y + a d     a = 1, 1/2, 1/4, ... until Phi falls enough
 
-Where a force has no potential, |r|^2 takes the place of Phi. The direction uses the clamped tangent, the derivative of the result the
-exact one: with the clamped one in its place every gradient of a squeezed net would be silently wrong.
+Near the solution the exact matrix doubles the digits in every step; the clamped one gains a factor of two or so where springs are
+squeezed. Where a force has no potential, |r|^2 takes the place of Phi and only the clamped matrix is used. The derivative of the result
+always takes the exact one: with the clamped one in its place every gradient of a squeezed net would be silently wrong.
 
 Source: Gast and others (2015), "Optimization Integrator for Large Time Steps", for the potential.
 """
@@ -25,19 +26,23 @@ from ..forces.linearisation import Tangent
 from ..linalg.base import LinearSolver, SolveInfo
 from ..linalg.exact import Converged
 from ..linalg.implicit import implicitly
+from ..linalg.iterative import IterativeSolver
 from ..linalg.operators import SpringMatrix
+from ..linalg.preconditioners import BlockJacobi
 from ..numerics import stopped
 from ..status import Flag, Status
 from ..vector import Vector
 from .stage import Stage
+from .truncated import truncated_cg
 
 
 class Newton(eqx.Module):
     """How far Newton's method goes.
 
     Attributes:
-        tolerance: wanted residual over the size of the forces; None is 1e-10 in float64 and 1e-5 in float32.
-        max_iter: most iterations. Where springs are squeezed hard, the clamped tangent gains only a factor of two or so in each.
+        tolerance: wanted residual over the size of the forces; None is 1e-10 in float64 and 1e-5 in float32. No less than rounding of the
+            positions allows.
+        max_iter: most iterations.
         max_halvings: most halvings of a step in the line search.
     """
 
@@ -85,17 +90,18 @@ class NewtonStage(Converged):
         start = still.system.hold(still.predictor.velocity)
         scale = self._scale(still)
         tolerance = self.options.tolerance or (1e-10 if start.dtype == jnp.float64 else 1e-5)
+        goal = tolerance * scale + still.rounding()
         merit = self._merit(still)
 
         def goes_on(at: _Progress) -> Array:
-            is_done = at.norm <= tolerance * scale
+            is_done = at.norm <= goal
             return ~is_done & (at.newton_iterations < self.options.max_iter) & jnp.isfinite(at.norm) & ~at.status.has(Flag.LINE_SEARCH)
 
         first = self.residual(still, start)
         zero = jnp.zeros((), jnp.int32)
         begin = _Progress(start, first, _norm(first), merit(start, first), zero, zero, Status.ok(), memory)
         end = lax.while_loop(goes_on, lambda at: self._iterate(still, merit, at), begin)
-        converged = end.norm <= tolerance * scale
+        converged = end.norm <= goal
         failed = end.status.then(Status.when(Flag.SOLVER, ~converged))
         status = jax.tree.map(lambda ok, bad: jnp.where(converged, ok, bad), Status.ok(), failed)
         relative = end.norm / jnp.where(scale > 0, scale, jnp.ones_like(scale))
@@ -104,8 +110,7 @@ class NewtonStage(Converged):
         return implicitly(problem, stage, end.y), SolveInfo(relative, end.iterations, status), end.memory
 
     def _iterate(self, stage: Stage, merit: Any, at: _Progress) -> _Progress:
-        matrix = stage.matrix(stage.reached(at.y), Tangent())
-        direction, info, memory = self.solver.solve_in_step(matrix, -at.r, None, at.memory)
+        direction, iterations, failed, memory = self._direction(stage, at)
         # Phi falls along d at the rate h r.d; |r|^2 is taken to fall at the rate -2 |r|^2 times the step.
         slope = stage.h * _dot(at.r, direction) if self._has_potential(stage) else -2 * at.norm * at.norm
         # Phi is a difference of large numbers: below this, its fall is rounding.
@@ -126,10 +131,36 @@ class NewtonStage(Converged):
         one = jnp.ones((), at.norm.dtype)
         begin = (one, jnp.zeros((), jnp.int32), *trial(one))
         _, _, y, r, value, falls = lax.while_loop(lambda f: ~f[-1] & (f[1] < self.options.max_halvings), halve, begin)
-        status = at.status.then(info.status).then(Status.when(Flag.LINE_SEARCH, ~falls))
+        status = at.status.then(failed).then(Status.when(Flag.LINE_SEARCH, ~falls))
         y, r, value = jax.tree.map(lambda new, old: jnp.where(falls, new, old), (y, r, value), (at.y, at.r, at.merit))
-        iterations = at.iterations + jnp.maximum(info.iterations, 0)
-        return _Progress(y, r, _norm(r), value, at.newton_iterations + 1, iterations, status, memory)
+        return _Progress(y, r, _norm(r), value, at.newton_iterations + 1, at.iterations + iterations, status, memory)
+
+    def _direction(self, stage: Stage, at: _Progress) -> tuple[Vector, Array, Status, Any]:
+        """Newton's direction, its iterations, how its solve ended, and what the solver carries on.
+
+        With the exact matrix, as long as conjugate gradients meet no curvature that is not positive: that converges fast. Else with the
+        clamped one, which is sure to lead down.
+        """
+        matrix = stage.matrix(stage.reached(at.y), Tangent())
+
+        def clamped(_: None) -> tuple[Vector, Array, Status, Any]:
+            d, info, memory = self.solver.solve_in_step(matrix, -at.r, None, at.memory)
+            return d, jnp.maximum(info.iterations, 0), info.status, memory
+
+        if not self._has_potential(stage):
+            return clamped(None)
+        _, jacobian = jax.linearize(lambda y: self.residual(stage, y), at.y)
+        # Loose far from the solution, tight near it: the number of digits then doubles with every step.
+        loose = jnp.minimum(jnp.asarray(0.1, at.norm.dtype), jnp.sqrt(at.norm / (at.norm + self._scale(stage))))
+        precondition = self.solver.preconditioner if isinstance(self.solver, IterativeSolver) else BlockJacobi()
+        infinite = jnp.full_like(at.norm, jnp.inf)
+        exact = truncated_cg(jacobian, -at.r, precondition.build(matrix), infinite, loose * at.norm)
+
+        def found(_: None) -> tuple[Vector, Array, Status, Any]:
+            return exact.d, jnp.zeros((), jnp.int32), Status.ok(), at.memory
+
+        d, iterations, status, memory = lax.cond(exact.is_cut, clamped, found, None)
+        return d, exact.iterations + iterations, status, memory
 
     def _has_potential(self, stage: Stage) -> bool:
         return stage.system.incremental_potential(stage.predictor, stage.h) is not None

@@ -24,6 +24,7 @@ from jaxtyping import Array
 from ..forces.linearisation import Linearisation
 from ..linalg.base import LinearSolver, SolveInfo
 from ..linalg.implicit import ImplicitProblem, implicitly
+from ..linalg.iterative import norm
 from ..linalg.operators import Blocks, SpringMatrix, isotropic
 from ..numerics import stopped
 from ..state import State
@@ -77,6 +78,14 @@ class Stage(eqx.Module):
         inertia = Blocks((isotropic(self.system.mass.astype(state.dtype) / self.h, state.position),))
         stiffness = self.system.stiffness_blocks(state, linearisation).scaled(self.h)
         return inertia + self.system.damping_blocks(state) + stiffness
+
+    def rounding(self) -> Array:
+        """What rounding of the positions makes of the forces [N]: a net at rest has no other force to compare with."""
+        at = self.predictor
+        largest = jnp.max(jnp.stack([jnp.max(jnp.abs(a)) for a in at.position]))
+        bounds = [bound for bound in (force.stiffness_bound(at) for force in self.system.forces) if bound is not None]
+        stiffness = self.system.hold(at.position.map(lambda a: sum(bounds, start=jnp.zeros_like(a))))
+        return 8 * float(jnp.finfo(largest.dtype).eps) * largest * norm(stiffness)
 
     def on_free(self, r: Vector, y: Vector) -> Vector:
         """Equations where free, y = 0 where known."""

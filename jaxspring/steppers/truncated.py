@@ -65,7 +65,7 @@ def truncated_cg(product: Operator, b: Vector, precondition: Operator, radius: A
         product: p -> K p, symmetric; it may be indefinite.
         b: right-hand side.
         precondition: r -> M^-1 r, symmetric positive definite.
-        radius: largest |d|_M.
+        radius: largest |d|_M; where infinite, d is the last iterate before a curvature that is not positive.
         enough: largest residual |b - K d|.
     """
     limit = min(10 * b.dim * math.prod(b.shape), 10_000)
@@ -88,7 +88,9 @@ def truncated_cg(product: Operator, b: Vector, precondition: Operator, radius: A
         is_cut = ~(is_convex & (inside < radius * radius))
         # The root of |d + a p| = radius with a > 0, without cancellation.
         room = radius * radius - s.dd
-        to_border = room / (s.dp + jnp.sqrt(s.dp * s.dp + s.pp * room))
+        is_bounded = jnp.isfinite(room)
+        reach = jnp.where(is_bounded, s.dp + jnp.sqrt(s.dp * s.dp + s.pp * room), jnp.ones_like(room))
+        to_border = jnp.where(is_bounded, room, zero) / reach
         a = jnp.where(is_cut, to_border, alpha)
         d, r = s.d + a * s.p, s.r - a * image
         z = precondition(r)

@@ -11,13 +11,16 @@ EXACT = js.ExactSolver(js.CG(tolerance=1e-13))
 
 
 def arch():
-    """An arch of 7 nodes pressed down between its pins: squeezed springs, an indefinite part in every block, a stable whole."""
-    net = js.lattice(7, js.STRUCTURAL + js.BEND)
-    angle = np.linspace(np.pi, 0, 7)
-    points = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    """An arch of 9 nodes, clamped at both feet and pressed down: squeezed springs, an indefinite part in every block, a stable whole.
+
+    Clamped, because an arch on two pins ends standing or hanging as rounding decides.
+    """
+    net = js.lattice(9, js.STRUCTURAL + js.BEND)
+    x = np.linspace(-1, 1, 9)
+    points = np.stack([x, 1 - x * x], axis=1)
     rest = net.lengths(points)
-    free = np.ones(7, bool)
-    free[[0, -1]] = False
+    free = np.ones(9, bool)
+    free[[0, 1, -2, -1]] = False
     system = js.System(net, 0.3, (js.Springs(net, 60.0, rest), js.Gravity([0.981, -9.81])), free=free)
     return system, net, points, rest
 
@@ -47,7 +50,7 @@ def test_springs_are_squeezed():
     system, net, points, _ = arch()
     found = js.equilibrium(system, js.State.from_points(net, points))
     assert bool(found.status.is_ok)
-    assert np.min(net.flatten(system.forces[0].strain(found.state))) < -0.03
+    assert np.min(net.flatten(system.forces[0].strain(found.state))) < -0.1
 
 
 @pytest.mark.slow
@@ -82,8 +85,8 @@ def test_where_free_nodes_start_does_not_matter():
         return jnp.mean(js.equilibrium(system, js.State.from_points(net, points)).state.position.y)
 
     gradient = np.asarray(jax.jit(jax.grad(mean))(jnp.asarray(points)))
-    assert not np.any(gradient[1:-1])
-    assert np.all(np.abs(gradient[[0, -1]]) > 1e-3)
+    assert not np.any(gradient[2:-2])
+    assert np.all(np.abs(gradient[[0, 1, -2, -1]]) > 1e-3)
 
 
 @pytest.mark.slow

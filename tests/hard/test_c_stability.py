@@ -90,8 +90,8 @@ def energies(stepper, k, points, dt):
     log_k=st.floats(-4, 6), log_step=st.floats(-2, 3), crumple=st.sampled_from([0.0, 1e-9, 1e-3, 0.1, 0.5]), seed=st.integers(0, 2**32 - 1)
 )
 def test_any_step_is_finite_and_tells_when_energy_rose(stepper, log_k, log_step, crumple, seed):
-    """Stiffness over ten decades, dt from 0.01 to 1,000 of sqrt(m/k), from flat to crumpled beyond recognition: numbers always; a rise of the
-    energy by more than a thousandth of what there was is always reported.
+    """Stiffness over ten decades, dt from 0.01 to 1,000 of sqrt(m/k), from flat to crumpled beyond recognition: numbers always; a rise of
+    the energy by more than a thousandth of what there was is always reported.
     """
     k = jnp.asarray(10.0**log_k)
     points = FLAT + crumple * np.random.default_rng(seed).standard_normal(FLAT.shape)

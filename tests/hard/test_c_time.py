@@ -166,8 +166,8 @@ def test_c15_soak(dtype):
     """A million steps of an 8-chain: bounded energy without drift, a centre of mass that stays, one program, no growth of memory."""
     n_pieces, n_steps = 4, 250_000
     system = js.System(CHAIN_8, 1.0, js.Springs(CHAIN_8, 100.0, 1.0))
-    # The three slowest modes: w dt is at most 0.055, so that the energy of Verlet swings by (w dt)^2 / 8 = 4e-4.
-    velocities = sum(np.cos(np.pi * p * (np.arange(8) + 0.5) / 8) for p in (1, 2, 3))[:, None].astype(dtype)
+    # The two slowest modes: w dt is at most 0.038, so that the energy of Verlet swings by (w dt)^2 / 8 = 2e-4.
+    velocities = sum(np.cos(np.pi * p * (np.arange(8) + 0.5) / 8) for p in (1, 2))[:, None].astype(dtype)
     state = js.State.from_points(CHAIN_8, (CHAIN_8.grid() - 3.5).astype(dtype), velocities)
     # Velocities in float32 do not sum to zero exactly: the centre moves with what is left, in a straight line.
     drift = float(np.mean(np.asarray(velocities, float)))
@@ -184,7 +184,7 @@ def test_c15_soak(dtype):
     times = 5e-3 * 250 * np.arange(1, len(energy) + 1)
     slope = np.polyfit(np.linspace(0, 1, len(energy)), energy / start, 1)[0]
     assert np.abs(energy / start - 1).max() <= 1e-3
-    # In float32 the rounding of a million kicks is a random walk of the energy of about 2e-4; it has no slope to speak of.
+    # In float32 the rounding of a million kicks is a random walk of the energy of 2e-4 to 6e-4; it has no slope to speak of.
     assert abs(slope) <= (1e-3 if dtype == np.float32 else 1e-4)
     assert np.abs(centre - drift * times).max() <= (5e-2 if dtype == np.float32 else 1e-9)
     assert float(state.time) == pytest.approx(5e-3 * n_pieces * n_steps, rel=1e-6)

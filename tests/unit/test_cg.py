@@ -43,8 +43,10 @@ def test_solution_is_numpys(spd, rng, solver):
     b = rng.standard_normal(30)
     x, info = solver(tolerance=1e-12).solve(times(spd), jnp.asarray(b))
     np.testing.assert_allclose(x, np.linalg.solve(spd, b), rtol=1e-10)
-    assert float(info.residual) == pytest.approx(np.linalg.norm(b - spd @ np.asarray(x)) / np.linalg.norm(b), rel=1e-2, abs=1e-15)
     assert bool(info.status.is_ok)
+    # Solved less tightly, so that NumPy's own rounding (a few 1e-15) is no part of the comparison.
+    x, info = solver(tolerance=1e-6).solve(times(spd), jnp.asarray(b))
+    assert float(info.residual) == pytest.approx(np.linalg.norm(b - spd @ np.asarray(x)) / np.linalg.norm(b), rel=1e-6)
 
 
 @each_solver

@@ -19,9 +19,11 @@ import jax.numpy as jnp
 from jax import lax
 
 from .linalg.implicit import SOLUTION
-from .watch import Carry, Watch
+from .status import Status
+from .watch import Carry
 
-Pair = tuple[Carry, Watch]
+Pair = tuple[Carry, Status]
+Inspect = Callable[[Carry, Status], Status]
 
 
 class Checkpointed(eqx.Module):
@@ -101,24 +103,22 @@ def make_plan(n_steps: int, save_every: int | None, adjoint: Adjoint, check_ever
 
 def run_blocks(
     advance: Callable[[Carry], Carry],
-    inspect: Callable[[Carry, Carry, Watch], Watch],
+    inspect: Inspect,
     keep: Callable[[Carry], Any],
     report: Callable[[Carry], None],
     pair: Pair,
     plan: Plan,
 ) -> tuple[Pair, Any]:
-    """Run the plan; returns the last carry, the watch, and the kept frames (None without)."""
+    """Run the plan; returns the last carry, what was seen, and the kept frames (None without)."""
     steps = _stepping(advance, inspect, plan)
 
     def block(pair: Pair, n: int) -> Pair:
-        before = pair[0]
-        carry, watch = _remat(lambda p: steps(p, n), plan)(pair)
-        return _seen((carry, watch), before)
+        return _seen(_remat(lambda p: steps(p, n), plan)(pair))
 
-    def _seen(pair: Pair, before: Carry) -> Pair:
-        carry, watch = pair
+    def _seen(pair: Pair) -> Pair:
+        carry, status = pair
         report(carry)
-        return carry, watch if plan.check_every else inspect(before, carry, watch)
+        return carry, status if plan.check_every else inspect(carry, status)
 
     def stretch(pair: Pair, n: int) -> Pair:
         """N steps, in blocks."""
@@ -150,7 +150,7 @@ def run_blocks(
             return lax.scan(frame, pair, None, length=n)
 
         after, saved = _remat(frames, plan)(pair)
-        return _seen(after, pair[0]), saved
+        return _seen(after), saved
 
     whole, rest = divmod(n_frames, plan.group)
     pair, saved = lax.scan(lambda p, _: group(p, plan.group), pair, None, length=whole)
@@ -161,16 +161,14 @@ def run_blocks(
     return pair, saved
 
 
-def _stepping(
-    advance: Callable[[Carry], Carry], inspect: Callable[[Carry, Carry, Watch], Watch], plan: Plan
-) -> Callable[[Pair, int], Pair]:
+def _stepping(advance: Callable[[Carry], Carry], inspect: Inspect, plan: Plan) -> Callable[[Pair, int], Pair]:
     def one(pair: Pair, _: None) -> tuple[Pair, None]:
-        before, watch = pair
+        before, status = pair
         after = advance(before)
         if plan.check_every:
             due = after.step % plan.check_every == 0
-            watch = lax.cond(due, lambda w: inspect(before, after, w), lambda w: w, watch)
-        return (after, watch), None
+            status = lax.cond(due, lambda s: inspect(after, s), lambda s: s, status)
+        return (after, status), None
 
     # What a solve found is kept: the backward pass then solves once per step, for its own right-hand side.
     keep = jax.checkpoint_policies.save_only_these_names(SOLUTION)
@@ -181,9 +179,9 @@ def _stepping(
             return step(pair, None)[0]
         if plan.check_every:
             return lax.scan(step, pair, None, length=n)[0]
-        carry, watch = pair
-        carry, _ = lax.scan(lambda c, _: (step((c, watch), None)[0][0], None), carry, None, length=n)
-        return carry, watch
+        carry, status = pair
+        carry, _ = lax.scan(lambda c, _: (step((c, status), None)[0][0], None), carry, None, length=n)
+        return carry, status
 
     return steps
 

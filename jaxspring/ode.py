@@ -148,7 +148,7 @@ def _solve(
 
     ready = system.prepare(state.dtype)
     start = ready.constrain(state)
-    before = begin(system, ready, Carry(start, None, jnp.zeros((), jnp.int32)), jnp.zeros((), state.dtype), None).status
+    before = begin(system, ready, Carry(start, None, jnp.zeros((), jnp.int32)), jnp.zeros((), state.dtype), None)
     end = diffrax.SubSaveAt(t1=True)
     solution = diffrax.diffeqsolve(
         _terms(ready, start, solver),

@@ -14,7 +14,7 @@ from typing import Any, TextIO
 import equinox as eqx
 
 N_CHUNKS = 20
-LONG_RUN = 20_000_000  # node-steps, about half a second on a CPU: shorter runs are not cut
+LONG_RUN = 80_000_000  # node-steps, a second on a CPU: Ctrl-C waits for no more
 
 
 class Progress(eqx.Module):

@@ -1,8 +1,8 @@
 """Fixed steps in time: `rollout`.
 
 The steps run in blocks of about sqrt(n_steps), a scan of scans, both levels rematerialised in reverse mode: the memory of a gradient
-grows with the square root of the number of steps, and costs one more forward run. Status is taken once per block: NaN is sticky, so the
-failed block is replayed to find the step. Time is exact: t = t0 + i dt.
+grows with the square root of the number of steps, and costs one more forward run. Status is taken once per block: NaN is sticky, so a
+run that failed is replayed to find the step. Time is exact: t = t0 + i dt.
 """
 
 from __future__ import annotations
@@ -59,11 +59,10 @@ class Resume(eqx.Module):
 
 
 class _Job(eqx.Module):
-    """How a run is done: the arguments of `rollout` besides system and state."""
+    """How a run is done: the arguments of `rollout` besides where it starts."""
 
     stepper: Stepper
     dt: Array
-    resume: Resume
     observe: Callable[[State], Any] | None
     plan: Plan = eqx.field(static=True)
     keep_solves: bool = eqx.field(static=True)
@@ -144,10 +143,10 @@ def rollout(
     dt = jnp.asarray(dt, state.dtype)
     plan = make_plan(n_steps, save_every, Checkpointed() if adjoint is None else adjoint, check_every)
     resume = Resume(state.time, jnp.zeros((), jnp.int32), _Unset()) if resume is None else resume
-    job = _Job(stepper, dt, resume, observe, plan, keep_solves)
-    if is_traced(system, state, job):
-        return _compiled(system, state, job, progress)
-    result = _run_eagerly(system, state, job, progress)
+    job = _Job(stepper, dt, observe, plan, keep_solves)
+    if is_traced(system, state, resume, job):
+        return _compiled(system, state, resume, job, progress)
+    result = _run_eagerly(system, state, resume, job, progress)
     if result.info.stable_dt is not None and bool(result.status.has(Flag.DT_LIMIT)):
         text = f"dt = {float(dt):.6g} s, but this run is surely stable only up to {float(result.info.stable_dt):.6g} s"
         warnings.warn(f"DT_LIMIT: {EXPLANATION[Flag.DT_LIMIT]}: {text}.", StabilityWarning, stacklevel=2)
@@ -156,43 +155,68 @@ def rollout(
     return result
 
 
-def _run(system: System, state: State, job: _Job, progress: Progress | None = None) -> Result:
-    """The whole run as one traced program."""
+class _Begun(eqx.Module):
+    """What is made once, before the first step: constants as the loop wants them, the memory of the stepper, what is wrong already."""
+
+    ready: System
+    state: State
+    resume: Resume
+    limit: Array | None
+    status: Status
+
+    def at(self, result: Result) -> _Begun:
+        """The same where a part of the run has ended."""
+        return eqx.tree_at(lambda b: (b.state, b.resume, b.status), self, (result.state, result.resume, Status.ok()))
+
+
+def _begin(system: System, state: State, resume: Resume, job: _Job) -> _Begun:
     ready = system.prepare(state.dtype)
     start = ready.constrain(state)
     still, still_start = stopped((ready, start))
     limit = dt_limit(still, still_start, job.stepper)
-    memory = job.stepper.init(ready, start) if isinstance(job.resume.memory, _Unset) else job.resume.memory
-    info = job.stepper.report(memory)
+    memory = job.stepper.init(ready, start) if isinstance(resume.memory, _Unset) else resume.memory
+    status = begin(system, ready, Carry(start, memory, resume.step), job.dt, limit)
+    return _Begun(ready, start, Resume(resume.start_time, resume.step, memory), limit, status)
+
+
+def _proceed(begun: _Begun, job: _Job, progress: Progress | None = None) -> Result:
+    """The steps, and how they ended."""
+    ready, resume, limit = begun.ready, begun.resume, begun.limit
+    still, info = stopped(ready), job.stepper.report(resume.memory)
     if job.keep_solves and (info is None or job.plan.save_every is None):
         raise ValueError("keep_solves keeps how an implicit stepper's solves ended in each frame: pass save_every and an implicit stepper.")
-    carry = Carry(start, memory, job.resume.step, None if info is None else Solves.none(info))
+    carry = Carry(begun.state, resume.memory, resume.step, None if info is None else Solves.none(info))
 
-    advance = partial(_advance, ready, job.stepper, job.dt, job.resume.start_time)
+    advance = partial(_advance, ready, job.stepper, job.dt, resume.start_time)
 
     def report(carry: Carry) -> None:
         if progress is not None:
             jax.debug.callback(partial(progress.update, total=job.plan.n_steps), carry.step)
 
-    watch = begin(system, ready, carry, job.dt, limit)
-    (carry, watch), frames = run_blocks(advance, partial(inspect, ready), job.keep, report, (carry, watch), job.plan)
+    first = stopped(carry)
+    (carry, status), frames = run_blocks(advance, partial(inspect, ready), job.keep, report, (carry, begun.status), job.plan)
     saved, solves_saved = (None, None) if frames is None else frames
     if carry.solves is None:
-        # The replay of a failed block is not part of what is differentiated.
-        still_dt, still_time = stopped((job.dt, job.resume.start_time))
-        status = settle(partial(_advance, still, job.stepper, still_dt, still_time), watch, still)
+        # The replay of a failed run is not part of what is differentiated.
+        still_dt, still_time = stopped((job.dt, resume.start_time))
+        status = settle(partial(_advance, still, job.stepper, still_dt, still_time), first, status, still)
     else:
         # An implicit step looks at itself, so that nothing need be replayed. What was wrong before the first step comes first.
-        at_start = watch.status.step == 0
-        status = watch.status.only_if(at_start).then(carry.solves.status).then(watch.status.only_if(~at_start))
+        at_start = status.step == 0
+        status = status.only_if(at_start).then(carry.solves.status).then(status.only_if(~at_start))
     return Result(
         state=carry.state,
         saved=saved,
-        status=_in_user_order(status, state),
+        status=_in_user_order(status, begun.state),
         info=Info(limit, carry.step, carry.solves, solves_saved),
-        resume=Resume(job.resume.start_time, carry.step, carry.memory),
-        effects=tuple(type(f).__name__ for f in system.forces),
+        resume=Resume(resume.start_time, carry.step, carry.memory),
+        effects=tuple(type(f).__name__ for f in ready.forces),
     )
+
+
+def _run(system: System, state: State, resume: Resume, job: _Job, progress: Progress | None = None) -> Result:
+    """The whole run as one traced program."""
+    return _proceed(_begin(system, state, resume, job), job, progress)
 
 
 def _in_user_order(status: Status, state: State) -> Status:
@@ -214,30 +238,36 @@ def _advance(system: System, stepper: Stepper, dt: Array, start_time: Array, car
 
 
 _compiled = eqx.filter_jit(_run)
+_compiled_begin = eqx.filter_jit(_begin)
+_compiled_proceed = eqx.filter_jit(_proceed)
 
 
-def _run_eagerly(system: System, state: State, job: _Job, progress: Progress | None) -> Result:
+def _run_eagerly(system: System, state: State, resume: Resume, job: _Job, progress: Progress | None) -> Result:
     """The run in chunks, with the host between them where somebody watches or the run is long."""
     plan = job.plan
-    is_long = progress is not None or plan.n_steps * math.prod(state.position.shape) > LONG_RUN
-    pieces = plan.pieces(N_CHUNKS) if is_long else [plan]
+    # A piece costs some passes over the state: without a watcher each is long enough for that not to show.
+    n_pieces = N_CHUNKS if progress is not None else min(N_CHUNKS, plan.n_steps * math.prod(state.position.shape) // LONG_RUN)
+    pieces = plan.pieces(n_pieces)
+    if len(pieces) == 1 and progress is None:
+        return _compiled(system, state, resume, job)
     result: Any = None
-    frames, resume, done = [], job.resume, 0
+    frames, done = [], 0
+    begun = _compiled_begin(system, state, resume, job)
     try:
         for piece in pieces:
-            latest = _compiled(system, state, _Job(job.stepper, job.dt, resume, job.observe, piece, job.keep_solves))
+            latest = _compiled_proceed(begun, replace(job, plan=piece))
             if len(pieces) > 1 or progress is not None:
                 jax.block_until_ready(latest)
             if result is not None:
                 latest = eqx.tree_at(lambda r: (r.status, r.info), latest, (result.status.then(latest.status), _joined(result, latest)))
-            result, state, resume, done = latest, latest.state, latest.resume, done + piece.n_steps
+            result, begun, done = latest, begun.at(latest), done + piece.n_steps
             frames.append((latest.saved, latest.info.solves_saved))
             if progress is not None:
                 progress.update(done, plan.n_steps)
     except KeyboardInterrupt:
         if result is None:
             raise
-        stopped_here = Status.when(Flag.INTERRUPTED, True, step=resume.step)
+        stopped_here = Status.when(Flag.INTERRUPTED, True, step=result.resume.step)
         result = eqx.tree_at(lambda r: r.status, result, result.status.then(stopped_here))
     if len(frames) > 1 and plan.save_every is not None:
         saved = jax.tree.map(lambda *parts: jnp.concatenate(parts), *frames)

@@ -1,6 +1,7 @@
-"""Looking for trouble during a rollout: once per block, and a replay of the failed block to name the step.
+"""Looking for trouble during a rollout: once per block, and a replay of a failed run to name the step.
 
-The watch costs one check of the state per block, and a copy of the carry at the start of the first block that failed.
+The watch costs one check of the state per block. NaN is sticky, so that nothing need be kept beside it: a run that failed is done again
+from its start, up to the step.
 """
 
 from __future__ import annotations
@@ -63,19 +64,7 @@ class Carry(eqx.Module):
     solves: Solves | None = None
 
 
-class Watch(eqx.Module):
-    """What the checks have seen so far.
-
-    Attributes:
-        status: joined statuses of all checks.
-        suspect: the carry at the start of the first block that ended with a NaN or an infinity.
-    """
-
-    status: Status
-    suspect: Carry
-
-
-def begin(system: System, ready: System, carry: Carry, dt: Array, limit: Array | None) -> Watch:
+def begin(system: System, ready: System, carry: Carry, dt: Array, limit: Array | None) -> Status:
     """Before the first step: constants that a constructor would refuse, a state that is not finite, a dt above the limit, and
     coordinates too large for the springs between them. The constants are read as the user gave them (`system`), which is one array
     where the prepared system (`ready`) holds one for every spring family.
@@ -99,16 +88,12 @@ def begin(system: System, ready: System, carry: Carry, dt: Array, limit: Array |
         slack = jnp.asarray(1 + 8 * float(jnp.finfo(limit.dtype).eps), limit.dtype)
         status = status.then(Status.when(Flag.DT_LIMIT, jnp.abs(dt) > limit * slack, step=carry.step))
     is_first = carry.step == 0
-    status = jax.tree.map(lambda seen, ok: jnp.where(is_first, seen, ok), status, Status.ok())
-    return lax.stop_gradient(Watch(status, carry))
+    return lax.stop_gradient(status.only_if(is_first))
 
 
-def inspect(system: System, before: Carry, after: Carry, watch: Watch) -> Watch:
-    """The watch brought up to date at the end of a block that began at `before`."""
-    seen = look(system, after)
-    is_first = seen.has(Flag.NONFINITE) & ~watch.status.has(Flag.NONFINITE)
-    suspect = jax.tree.map(lambda new, old: jnp.where(is_first, new, old), lax.stop_gradient(before), watch.suspect)
-    return Watch(watch.status.then(seen), suspect)
+def inspect(system: System, after: Carry, status: Status) -> Status:
+    """The status brought up to date at the end of a block."""
+    return status.then(look(system, after))
 
 
 def look(system: System, carry: Carry) -> Status:
@@ -124,22 +109,21 @@ def look(system: System, carry: Carry) -> Status:
     return status
 
 
-def settle(advance: Callable[[Carry], Carry], watch: Watch, system: System) -> Status:
-    """The final status: where a block failed, it is replayed to name the step, the node and the effect."""
-    status = watch.status
+def settle(advance: Callable[[Carry], Carry], first: Carry, status: Status, system: System) -> Status:
+    """The final status: a run that failed is replayed from `first` to name the step, the node and the effect."""
 
     def replay(_: None) -> tuple[Array, Array, Array]:
-        last, first = lax.while_loop(
+        last, failed = lax.while_loop(
             lambda pair: ~jnp.any(_nonfinite(pair[1].state)) & (pair[1].step < status.step),
             lambda pair: (pair[1], advance(pair[1])),
-            (watch.suspect, watch.suspect),
+            (first, first),
         )
-        node = jnp.argmax(jnp.ravel(_nonfinite(first.state)))
-        return first.step, node.astype(jnp.int32), _blame(system, last.state)
+        node = jnp.argmax(jnp.ravel(_nonfinite(failed.state)))
+        return failed.step, node.astype(jnp.int32), _blame(system, last.state)
 
-    failed = status.has(Flag.NONFINITE) & (status.step > 0)
+    has_failed = status.has(Flag.NONFINITE) & (status.step > 0)
     known = (status.step, status.node, status.effect)
-    step, node, effect = lax.cond(failed, replay, lambda _: known, None)
+    step, node, effect = lax.cond(has_failed, replay, lambda _: known, None)
     return lax.stop_gradient(Status(status.flags, step, node, effect, status.count))
 
 

@@ -8,6 +8,7 @@ Source: slide "Force Computation" (length |r|, deformation e = |r| - l).
 from __future__ import annotations
 
 import abc
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -20,7 +21,7 @@ from ..numerics import cast_inexact, tiny
 from ..state import State
 from ..status import Flag
 from ..topology.base import Topology
-from ..topology.edge_field import EdgeField
+from ..topology.edge_field import EdgeField, ZeroOutside
 from ..vector import Vector
 from .base import Finding, Force, any_refused
 from .laws import Hooke, Law, PowerLaw, spring_block, spring_energy, spring_pull
@@ -96,6 +97,9 @@ class Springs(Force):
         """Constants as edge fields of `dtype`."""
         rule = self.stiffness
         stiffness = rule.prepare(self.net, dtype) if isinstance(rule, StiffnessRule) else self.net.edge_field(rule, "stiffness")
+        if isinstance(stiffness, EdgeField):
+            # Pulls then vanish in a lattice's margins of themselves, and no step need mask them.
+            stiffness = ZeroOutside(self.net.inside(stiffness, 0).families)
         ready = eqx.tree_at(lambda s: (s.stiffness, s.rest_length), self, (stiffness, self.net.edge_field(self.rest_length, "rest_length")))
         return cast_inexact(ready, dtype)
 
@@ -103,8 +107,10 @@ class Springs(Force):
         """Sum of the pulls at each node [N]."""
         if self.net.n_springs == 0:
             return Vector.zeros_like(state.position)
+        if isinstance(self.stiffness, ZeroOutside) and self.law.is_finite_at_zero:
+            return self._embed(self.net.net_pull(partial(spring_pull, self.law), self._seen(state), *self._constants(state)), state)
         d, k, l = self._along(state)
-        pulls = self.net.map_springs(lambda *spring: spring_pull(self.law, *spring), d, k, l)
+        pulls = self.net.map_springs(partial(spring_pull, self.law), d, k, l)
         return self._embed(self.net.accumulate(pulls), state)
 
     def energy(self, state: State) -> Array | None:
@@ -193,10 +199,13 @@ class Springs(Force):
     def _seen(self, state: State) -> Vector:
         return state.position if self.axes is None else Vector(tuple(state.position[a] for a in self.axes))
 
-    def _along(self, state: State) -> tuple[EdgeField, Array | EdgeField, Array | EdgeField]:
+    def _constants(self, state: State) -> tuple[Array | EdgeField, Array | EdgeField]:
         rule = self.stiffness
         k = rule.stiffness(self.net, state) if isinstance(rule, StiffnessRule) else self.net.edge_field(rule, "stiffness")
-        k, l = cast_inexact((k, self.net.edge_field(self.rest_length, "rest_length")), state.dtype)
+        return cast_inexact((k, self.net.edge_field(self.rest_length, "rest_length")), state.dtype)
+
+    def _along(self, state: State) -> tuple[EdgeField, Array | EdgeField, Array | EdgeField]:
+        k, l = self._constants(state)
         d = self.net.difference(self._seen(state))
         return d if self.law.is_finite_at_zero else self._filled(d), k, l
 

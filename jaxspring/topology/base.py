@@ -73,10 +73,13 @@ class Topology(eqx.Module):
     def accumulate(self, pulls: EdgeField) -> Vector:
         """Force on each node from the pull of each spring: plus on its tail, minus on its head."""
 
+    def net_pull(self, pull: Callable[..., Vector], x: Vector, *fields: Any) -> Vector:
+        """Sum of the pulls at each node, `pull(D x, *fields)` family by family, where a pull vanishes for springs that do not exist."""
+        return self.accumulate(self.map_springs(pull, self.difference(x), *fields))
+
     def stiffness_product(self, block: Callable[..., Vector], v: Vector, *fields: EdgeField) -> Vector:
         """D' B D v, where `block(d, *fields of a family)` is B d and vanishes where no spring exists; periods do not wrap `v`."""
-        net = self.unboxed()
-        return -net.accumulate(net.map_springs(block, net.difference(v), *fields))
+        return -self.unboxed().net_pull(block, v, *fields)
 
     @abc.abstractmethod
     def incident_sum(self, values: EdgeField) -> Array:

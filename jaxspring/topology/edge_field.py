@@ -78,3 +78,7 @@ class EdgeField(eqx.Module):
         if isinstance(other, (np.ndarray, np.generic)):
             other = jnp.asarray(other, jax.tree.leaves(self.families)[0].dtype)
         return self.map(lambda entry: operation(entry, other))
+
+
+class ZeroOutside(EdgeField):
+    """An edge field that is zero where a lattice keeps places of springs that do not exist; arithmetic gives a plain `EdgeField`."""

@@ -138,16 +138,17 @@ class Lattice(Topology):
         columns = zip(*(pull.components for pull in pulls.families), strict=True)
         return -Vector(tuple(linear_call(forward, backward, (), tuple(column)) for column in columns))
 
-    def stiffness_product(self, block: Callable[..., Vector], v: Vector, *fields: EdgeField) -> Vector:
-        """D' B D v without masks, since B vanishes in the margins."""
+    def net_pull(self, pull: Callable[..., Vector], x: Vector, *fields: Any) -> Vector:
+        """Sum of the pulls at each node without masks, since pulls vanish in the margins."""
         if not self.offsets:
-            return Vector.zeros_like(v)
+            return Vector.zeros_like(x)
         apart, together = partial(_difference_anywhere, self.grid_shape), partial(_minus_accumulate_anywhere, self.grid_shape)
-        columns = [linear_call(apart, together, (), a) for a in v]
-        d = EdgeField(tuple(Vector(parts) for parts in zip(*columns, strict=True)))
-        pulls = self.map_springs(block, d, *fields)
-        back = zip(*(pull.components for pull in pulls.families), strict=True)
-        return Vector(tuple(linear_call(together, apart, (), tuple(column)) for column in back))
+        columns = [linear_call(apart, together, (), a) for a in x]
+        families = (Vector(parts) for parts in zip(*columns, strict=True))
+        d = EdgeField(tuple(families if self.box is None else (minimum_image(d, self.box) for d in families)))
+        pulls = self.map_springs(pull, d, *fields)
+        back = zip(*(p.components for p in pulls.families), strict=True)
+        return -Vector(tuple(linear_call(together, apart, (), tuple(column)) for column in back))
 
     def incident_sum(self, values: EdgeField) -> Array:
         """Sum over the springs at each node."""

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 import jaxspring as js
+from jaxspring.topology.reduction import choose_reduction
 
 from . import scenes
 from .measure import Case, Panel, arguments, draw, measure, ratio_of_pairs, show, write
@@ -70,9 +71,9 @@ def lattices(sizes: list[tuple[int, int]], rounds: int) -> list[dict]:
 def graphs(sizes: list[tuple[int, int]], rounds: int) -> list[dict]:
     """One row per size: the library's default against both of its reductions and the bare scatter form."""
     rows = []
-    default = type(scenes.mesh(10)[0].net.reduction).__name__
     for n_nodes, n_steps in sizes:
         by_kind = {kind.__name__: scenes.mesh(n_nodes, reduction=kind) for kind in (js.Gather, js.Scatter)}
+        default = choose_reduction(n_nodes).__name__
         cases = [Case("bare scatter", *scenes.bare_mesh(*by_kind["Scatter"], DT, n_steps))]
         cases += [Case(kind, *scenes.program(system, state, DT, n_steps)) for kind, (system, state) in by_kind.items()]
         timed = measure(cases, rounds)

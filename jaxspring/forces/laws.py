@@ -178,7 +178,7 @@ def _tangent(static: Any, residuals: Any, operand: Any) -> Vector:
     dd, *constants = operand
     squared, is_long = _guarded(d)
     weight, slope = _linearised(eqx.combine(params, static), squared, is_long, stiffness, rest_length)
-    inverse = lax.rsqrt(squared)
+    inverse = _inverse_length(squared)
     of_constants = partial(_weight, static, squared)
     _, by_constants = jax.jvp(of_constants, (stiffness, rest_length, params), tuple(constants))
     along = slope * (d.dot(dd) * inverse) * inverse + by_constants
@@ -190,9 +190,10 @@ def _tangent_transpose(static: Any, residuals: Any, q: Vector) -> Any:
     d, stiffness, rest_length, params = residuals
     squared, is_long = _guarded(d)
     weight, slope = _linearised(eqx.combine(params, static), squared, is_long, stiffness, rest_length)
-    inverse = lax.rsqrt(squared)
+    # As in the laws, so that XLA computes it once.
+    inverse = _inverse_length(squared)
     # A division, so that XLA keeps it as an array of its own instead of computing it anew in each of its five readers.
-    length = squared * inverse
+    length = lax.sqrt(squared)
     along = d.dot(q) / length
     _, pullback = jax.vjp(partial(_weight, static, squared), stiffness, rest_length, params)
     dk, dl, dparams = pullback(along * length)

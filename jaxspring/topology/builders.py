@@ -15,10 +15,10 @@ from .._checks import finite
 from .graph import Graph
 from .reduction import Gather, Scatter
 
-Reductions = type[Gather] | type[Scatter]
+Reductions = type[Gather] | type[Scatter] | None
 
 
-def from_triangles(triangles: Any, n_nodes: int, *, reduction: Reductions = Gather) -> Graph:
+def from_triangles(triangles: Any, n_nodes: int, *, reduction: Reductions = None) -> Graph:
     """A spring along every side of every triangle, one per side; the triangles are kept as `net.triangles`.
 
     Args:
@@ -46,7 +46,7 @@ def from_triangles(triangles: Any, n_nodes: int, *, reduction: Reductions = Gath
     return Graph.from_edges(_sides(corners), n_nodes, triangles=corners, reduction=reduction)
 
 
-def delaunay(points: Any, *, reduction: Reductions = Gather) -> Graph:
+def delaunay(points: Any, *, reduction: Reductions = None) -> Graph:
     """Springs along the Delaunay triangulation of points in the plane, or tetrahedralisation of points in space.
 
     Args:
@@ -87,7 +87,7 @@ def delaunay(points: Any, *, reduction: Reductions = Gather) -> Graph:
     return Graph.from_edges(_sides(found.simplices), n_nodes, triangles=surface, reduction=reduction)
 
 
-def from_mesh(path: str | pathlib.Path, *, reduction: Reductions = Gather) -> tuple[Graph, np.ndarray]:
+def from_mesh(path: str | pathlib.Path, *, reduction: Reductions = None) -> tuple[Graph, np.ndarray]:
     """A network from a surface mesh file: OBJ, STL, PLY, OFF and what else trimesh reads. Needs the extra `mesh`.
 
     Vertices at one place are merged, so that seams of texture or normals do not tear the net. Unused vertices are dropped.
@@ -126,7 +126,7 @@ def from_mesh(path: str | pathlib.Path, *, reduction: Reductions = Gather) -> tu
     return from_triangles(np.asarray(mesh.faces, np.int64), len(points), reduction=reduction), points
 
 
-def from_scipy(matrix: Any, *, reduction: Reductions = Gather) -> tuple[Graph, np.ndarray]:
+def from_scipy(matrix: Any, *, reduction: Reductions = None) -> tuple[Graph, np.ndarray]:
     """A network from a symmetric adjacency matrix: one spring per stored pair i < j.
 
     Args:
@@ -167,7 +167,7 @@ def from_scipy(matrix: Any, *, reduction: Reductions = Gather) -> tuple[Graph, n
 
 
 def from_networkx(
-    graph: Any, attributes: tuple[str, ...] = (), *, reduction: Reductions = Gather
+    graph: Any, attributes: tuple[str, ...] = (), *, reduction: Reductions = None
 ) -> tuple[Graph, list[Hashable], tuple[np.ndarray, ...]]:
     """A network from an undirected NetworkX graph: one spring per edge, parallel edges included.
 

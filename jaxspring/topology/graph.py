@@ -21,7 +21,7 @@ from .base import Topology
 from .edge_field import EdgeField
 from .lattice import _as_box, minimum_image
 from .permutation import Permutation
-from .reduction import Gather, Reduction, Scatter
+from .reduction import Gather, Reduction, Scatter, choose_reduction
 
 
 class Graph(Topology):
@@ -46,7 +46,7 @@ class Graph(Topology):
 
     @staticmethod
     def from_edges(
-        edges: Any, n_nodes: int, *, box: Any = None, triangles: Any = None, reduction: type[Gather] | type[Scatter] = Gather
+        edges: Any, n_nodes: int, *, box: Any = None, triangles: Any = None, reduction: type[Gather] | type[Scatter] | None = None
     ) -> Graph:
         """A network from an (E, 2) integer array: tail and head node of each spring. Springs may be repeated.
 
@@ -56,6 +56,7 @@ class Graph(Topology):
             box: (D,) period of each coordinate [m]; zero where a coordinate is not periodic.
             triangles: (T, 3) triangles, kept for plots and surfaces.
             reduction: `Gather` (no scatter in any program) or `Scatter`, which compiles sooner; see docs/benchmarks.md for their speed.
+                None takes `Gather`, but `Scatter` on a CPU for more nodes than `FASTER_BY_SCATTER`.
 
         Raises:
             ValueError: no node, a node that does not exist, a spring that joins a node to itself.
@@ -72,7 +73,7 @@ class Graph(Topology):
         inner = np.argsort(near)[pairs]
         springs = Permutation(np.lexsort((inner.max(axis=1), inner.min(axis=1))))
         tails, heads = inner[springs.order].T
-        sums, order = reduction.build(tails, heads, n_nodes)
+        sums, order = (choose_reduction(n_nodes) if reduction is None else reduction).build(tails, heads, n_nodes)
         nodes = Permutation(near[order])
         tails, heads = nodes.inverse[pairs[springs.order]].T
         return Graph(

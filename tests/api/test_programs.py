@@ -163,7 +163,8 @@ def test_a_rollout_adds_the_statuses_alone():
     """A rollout whose status nobody asks for is the hand-written loop; with it, only what finding trouble takes is added."""
     bare = seen(jax.jit(minimal_rollout).lower(*minimal(N, N, N, N, N + 1, N + 1, (), ())))
     stateless = seen(lowered_rollout(lambda result: result.state))
-    # Outside the loop k and l are cut into families and brought to the extended range, k zero there; in it, the start time is added to i dt.
+    # Outside the loop k and l are cut into families and brought to the extended range, where k is zero; in it, the start time is added
+    # to i dt.
     more = stateless - bare
     assert not bare - stateless
     assert more == Counter(slice=2, pad=2, add=1, select=1)

@@ -113,7 +113,7 @@ def rollout(
         system: what is simulated.
         state: where it starts. Float32 in, float32 out.
         stepper: how it steps, e.g. `SymplecticEuler()`.
-        dt: time step [s]; may be traced. Zero returns the state unchanged; negative runs backward.
+        dt: time step [s]; may be traced. Zero returns the state unchanged; negative runs backward, by explicit steppers.
         n_steps: number of steps (static).
         save_every: keep a frame after every so many steps; must divide `n_steps`. None keeps none.
         observe: what to keep of a state in each frame; None keeps the whole state. A new lambda at every call compiles anew.
@@ -128,7 +128,8 @@ def rollout(
         (Ctrl-C) returns what was done, with INTERRUPTED.
 
     Raises:
-        ValueError: n_steps or save_every that do not fit, a dt that is not finite, `observe` without `save_every`.
+        ValueError: n_steps or save_every that do not fit, a dt that is not finite, a negative one where the stepper does not run backward,
+            `observe` without `save_every`.
 
     >>> import jaxspring as js
     >>> net = js.lattice(2)
@@ -140,6 +141,8 @@ def rollout(
     _check_steps(n_steps, save_every, observe, check_every)
     if is_concrete(dt):
         finite("dt", dt)
+        if np.any(np.asarray(dt) < 0) and not stepper.runs_backward:
+            raise ValueError(f"dt = {dt}, but {type(stepper).__name__} does not run backward. Use VelocityVerlet(), or a positive dt.")
     dt = jnp.asarray(dt, state.dtype)
     plan = make_plan(n_steps, save_every, Checkpointed() if adjoint is None else adjoint, check_every)
     resume = Resume(state.time, jnp.zeros((), jnp.int32), _Unset()) if resume is None else resume

@@ -29,6 +29,11 @@ class Stepper(eqx.Module):
     def step(self, system: System, state: State, dt: Array, memory: Any) -> tuple[State, Any]:
         """The state one `dt` [s] later, and what to carry. The caller sets the new state's time."""
 
+    @property
+    def runs_backward(self) -> bool:
+        """Whether dt may be negative."""
+        return True
+
     def report(self, memory: Any) -> SolveInfo | None:
         """How the linear or nonlinear solve of the last step ended; None for a stepper that solves nothing."""
         return None

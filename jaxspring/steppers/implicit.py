@@ -19,6 +19,7 @@ import abc
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -121,8 +122,20 @@ class ImplicitStepper(Stepper):
         nothing = SolveInfo(jnp.zeros((), state.dtype), jnp.zeros((), jnp.int32), Status.ok())
         return Memory(carried, nothing, history, _closed_energy(system, state))
 
+    @property
+    def runs_backward(self) -> bool:
+        """No: backward in time the matrix is not positive definite."""
+        return False
+
     def step(self, system: System, state: State, dt: Array, memory: Memory) -> tuple[State, Memory]:
-        """One stage, and the state after it."""
+        """One stage, and the state after it; with dt = 0, which no matrix survives, the state itself."""
+        stands = dt == 0
+        new, after = self._step(system, state, jnp.where(stands, jnp.ones_like(dt), dt), memory)
+        status = Status.when(Flag.INVALID, dt < 0).then(after.info.status.only_if(~stands))
+        after = eqx.tree_at(lambda m: m.info.status, after, status)
+        return jax.tree.map(lambda old, moved: jnp.where(stands, old, moved), state, new), after
+
+    def _step(self, system: System, state: State, dt: Array, memory: Memory) -> tuple[State, Memory]:
         stage = self.stage(system, state, dt, memory.history)
         if self.newton is None:
             problem: Any = LinearStage(self.solver, self.stiffness)

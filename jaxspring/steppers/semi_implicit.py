@@ -71,6 +71,11 @@ class SemiImplicit(Stepper):
         status = _breakdown(given, new).then(info.status)
         return new, Memory(carried, SolveInfo(info.residual, info.iterations, status), None, None)
 
+    @property
+    def runs_backward(self) -> bool:
+        """No: damping backward in time grows without bound."""
+        return False
+
     def report(self, memory: Memory | None) -> SolveInfo | None:
         """How the last solve ended; None where nothing is solved."""
         return None if memory is None else memory.info

@@ -36,7 +36,7 @@ def test_a5_implicit_lone_node():
 
 
 def test_a12_implicit_negative_stiffness():
-    """Negative stiffness: the exact matrix is called indefinite; the clamped one drops the spring's part, and the step is that of its force alone."""
+    """Negative stiffness: the exact matrix is called indefinite; the clamped one drops the spring's part: the step of its force alone."""
     net = js.lattice(2)
     start = js.State.from_points(net, [[0.0], [1.5]])
     system = js.System(net, 1.0, js.Springs(net, -10.0, 1.0, allow_negative_stiffness=True))

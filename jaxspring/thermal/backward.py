@@ -6,12 +6,12 @@
     dy = dtheta                        for the former,     dy = (r - dt K dtheta) / C    for nodes that melt
 
 S are the slopes of boundaries, K the conductances. Where the power is linear this is one solve; with latent heat or radiation it is
-Newton's method, all of whose matrices are symmetric and positive definite.
+Newton's method, all of whose matrices are symmetric and positive definite; `phase.py` keeps it from cycling where nodes melt.
 
 Solves end at a tolerance, but heat must not be lost to it: at the end y rises everywhere by the one number that makes the sum of the
 equations hold, sum(r) = 0 (a Galerkin correction by a constant). The sum then holds to rounding, whatever the tolerance and dt.
 
-Source: Brugnano and Casulli (2009), "Iterative solution of piecewise linear systems", for the iteration.
+Source: backward Euler, in the conservative form of the slide "Heating and Melting".
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from ..numerics import stopped
 from ..status import Flag, Status
 from ..vector import Vector
 from .flow import Flow
+from .phase import Equation, relaxed, searched
 
 
 class HeatIteration(eqx.Module):
@@ -47,40 +48,13 @@ class HeatIteration(eqx.Module):
     """
 
     tolerance: float | None = eqx.field(static=True, default=None)
-    max_iter: int = eqx.field(static=True, default=50)
+    max_iter: int = eqx.field(static=True, default=100)
 
     def __check_init__(self) -> None:
         if self.tolerance is not None and not self.tolerance > 0:
             raise ValueError(f"tolerance = {self.tolerance}, but must be positive. Pass e.g. tolerance=1e-6.")
         if self.max_iter < 1:
             raise ValueError(f"max_iter = {self.max_iter}: without an iteration nothing is solved. Pass 1 or more.")
-
-
-class Equation(eqx.Module):
-    """What is given of a step.
-
-    Attributes:
-        flow: what heats the nodes at the end of the step.
-        start: y at its beginning [K].
-        dt: [s].
-        trust: 1, or NaN where y was not found: a derivative of it is then NaN, never a wrong number.
-    """
-
-    flow: Flow
-    start: Array
-    dt: Array
-    trust: Array
-
-    def missing(self, y: Array) -> Array:
-        """R(y) [J], zero where held."""
-        flow = self.flow
-        r = flow.capacity * (self.start - y) + self.dt * flow.power(flow.temperature(y))
-        held = flow.held()
-        return r if held is None else jnp.where(held, jnp.zeros_like(r), r)
-
-    def matrix(self, y: Array) -> SpringMatrix:
-        """C + dt (S + K), identity where held or melting."""
-        return self.flow.matrix(y, self.dt)
 
 
 class _Stand(NamedTuple):
@@ -148,21 +122,26 @@ class BackwardStep(ImplicitProblem):
         return matrix.pick(x, zero)[0], info.status
 
     def _improved(self, equation: Equation, stand: _Stand) -> _Stand:
-        """One solve. The unknown is the temperature over the middle of all, so that a tolerance is one of differences."""
-        flow, matrix = equation.flow, lax.optimization_barrier(equation.matrix(stand.y))
-        theta = flow.temperature(stand.y)
-        over = theta - 0.5 * (jnp.max(theta) + jnp.min(theta))
-        zero = Vector((jnp.zeros_like(over),))
+        """One solve over the nodes that do not melt, and what those that do take up.
+
+        The unknown of the first is the temperature over the middle of all, so that a tolerance is one of differences; later ones
+        correct what is missing.
+        """
+        flow = equation.flow
+        y, missing = stand.y, stand.missing
+        if flow.latent is not None:
+            y = relaxed(equation, relaxed(equation, y))
+            missing = equation.missing(y)
+        matrix = lax.optimization_barrier(equation.matrix(y))
+        theta = flow.temperature(y)
+        zero = Vector((jnp.zeros_like(theta),))
+        over = jnp.where(stand.n_done == 0, theta - 0.5 * (jnp.max(theta) + jnp.min(theta)), zero[0])
         before = matrix.pick(Vector((over,)), zero)
-        right_side = stand.missing + matrix(before)[0]
-        rise = _rise(matrix, stand.missing)
-        after, status = self._change(matrix, right_side, matrix.pick(before + rise, zero)[0])
+        right_side = missing + matrix(before)[0]
+        guess = matrix.pick(before + _rise(matrix, missing), zero)[0]
+        after, status = self._change(matrix, right_side, guess)
         dtheta = after - before[0]
-        y, melting = stand.y + dtheta, flow.is_melting(stand.y)
-        if melting is not None:
-            held = flow.held()
-            melting = melting if held is None else melting & ~held
-            y = jnp.where(melting, stand.y + (stand.missing - _times(matrix, dtheta)) / flow.capacity, y)
+        y = y + dtheta if flow.latent is None else searched(equation, matrix, y, missing, dtheta)
         return _Stand(y, equation.missing(y), stand.n_done + 1, status)
 
     def _goes_on(self, equation: Equation, stand: _Stand) -> Array:

@@ -53,7 +53,12 @@ class LatentHeat(eqx.Module):
 
     def temperature(self, y: Array, capacity: Array) -> Array:
         """Temperature [K]."""
-        return self.melting + y - self._plateau(y, capacity)
+        # In this order nodes that melt are at the melting point exactly.
+        return self.melting + self.above(y, capacity)
+
+    def above(self, y: Array, capacity: Array) -> Array:
+        """Temperature over the melting point [K]."""
+        return y - self._plateau(y, capacity)
 
     def enthalpy(self, y: Array, capacity: Array) -> Array:
         """Latent heat taken up [J]."""
@@ -61,7 +66,7 @@ class LatentHeat(eqx.Module):
 
     def is_melting(self, y: Array, capacity: Array) -> Array:
         """Which nodes are on the plateau, where heat does not change the temperature."""
-        return (y > 0) & (y < self.latent / capacity)
+        return (y >= 0) & (y <= self.latent / capacity)
 
     def _plateau(self, y: Array, capacity: Array) -> Array:
         return jnp.clip(y, jnp.zeros_like(y), jnp.broadcast_to(self.latent / capacity, y.shape))

@@ -135,9 +135,10 @@ class BackwardStep(ImplicitProblem):
         matrix = lax.optimization_barrier(equation.matrix(y))
         theta = flow.temperature(y)
         zero = Vector((jnp.zeros_like(theta),))
-        over = jnp.where(stand.n_done == 0, theta - 0.5 * (jnp.max(theta) + jnp.min(theta)), zero[0])
-        before = matrix.pick(Vector((over,)), zero)
-        right_side = missing + matrix(before)[0]
+        over = theta - 0.5 * (jnp.max(theta) + jnp.min(theta))
+        is_first = stand.n_done == 0
+        before = matrix.pick(Vector((jnp.where(is_first, over, zero[0]),)), zero)
+        right_side = jnp.where(is_first, _afresh(equation, matrix, y, over), missing)
         guess = matrix.pick(before + _rise(matrix, missing), zero)[0]
         after, status = self._change(matrix, right_side, guess)
         dtheta = after - before[0]
@@ -173,6 +174,20 @@ def balanced(equation: Equation, y: Array) -> Array:
     total = jnp.sum(weight)
     rise = jnp.sum(equation.missing(y)) / jnp.where(total > 0, total, jnp.ones_like(total))
     return y + rise if held is None else jnp.where(held, y, y + rise)
+
+
+def _afresh(equation: Equation, matrix: SpringMatrix, y: Array, over: Array) -> Array:
+    """What is missing, plus the matrix times `over` where free, without the difference of large terms that these two are."""
+    flow, zero = equation.flow, jnp.zeros_like(over)
+    given = flow.capacity * (equation.start - y) + equation.dt * flow.supplied(flow.temperature(y))
+    for diagonal in matrix.blocks.diagonal:
+        given = given + diagonal[0] * over
+    if matrix.free[0] is None:
+        return given
+    stuck = matrix.pick(Vector((zero,)), Vector((over,)))
+    for link in matrix.blocks.springs:
+        given = given - link.product(stuck)[0]
+    return given
 
 
 def _rise(matrix: SpringMatrix, missing: Array) -> Array:

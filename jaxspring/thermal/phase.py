@@ -67,26 +67,31 @@ def relaxed(equation: Equation, y: Array) -> Array:
 
 
 def searched(equation: Equation, matrix: SpringMatrix, y: Array, missing: Array, dtheta: Array) -> Array:
-    """Y after a change of temperature, shortened to where F falls most; nodes that melt take up what then reaches them."""
-    flow, latent = equation.flow, _latent(equation)
-    h = latent.enthalpy(y, flow.capacity)
-    over = latent.above(y, flow.capacity)
-    pushed = matrix.blocks.product(Vector((dtheta,)))[0]
-    slope, curvature = -jnp.sum((missing + h) * dtheta), jnp.sum(dtheta * pushed)
+    """Y after a change of temperature, shortened to where F falls most; nodes that melt take up what then reaches them.
 
-    def merit(s: Array) -> Array:
-        kink = jnp.maximum(over + s * dtheta, jnp.zeros_like(over)) - jnp.maximum(over, jnp.zeros_like(over))
-        return s * slope + 0.5 * s * s * curvature + jnp.sum(latent.latent * kink)
+    Tried are the step, its halves and quarters, and the step in which every node stops where it would cross the melting point.
+    """
+    flow, latent = equation.flow, _latent(equation)
+    h, over = latent.enthalpy(y, flow.capacity), latent.above(y, flow.capacity)
+    crosses = (over * (over + dtheta) < 0) | ((over != 0) & (over + dtheta == 0))
+    steps = (dtheta, jnp.where(crosses, -over, dtheta))
+    pushes = tuple(matrix.blocks.product(Vector((step,)))[0] for step in steps)
+    slopes = tuple(-jnp.sum((missing + h) * step) for step in steps)
+    curvatures = tuple(jnp.sum(step * push) for step, push in zip(steps, pushes, strict=True))
+
+    def merit(which: int, s: Array) -> Array:
+        kink = jnp.maximum(over + s * steps[which], jnp.zeros_like(over)) - jnp.maximum(over, jnp.zeros_like(over))
+        return s * slopes[which] + 0.5 * s * s * curvatures[which] + jnp.sum(latent.latent * kink)
 
     lengths = 0.5 ** jnp.arange(_HALVINGS + 1, dtype=y.dtype)
+    merits = lax.map(lambda s: merit(0, s), lengths)
     # Without a change of phase the whole step is the lowest; rounding of F must not shorten it.
-    crosses = jnp.any((over * (over + dtheta) < 0) | ((over != 0) & (over + dtheta == 0)))
-    best = lengths[jnp.argmin(lax.map(merit, lengths))]
-    s = jnp.where(crosses, best, jnp.ones_like(best))
-    reached = over + s * dtheta
-    zero = jnp.zeros_like(h)
-    full = jnp.broadcast_to(latent.latent, h.shape)
-    h = jnp.where(reached > 0, full, jnp.where(reached < 0, zero, jnp.clip(h + missing - s * pushed, zero, full)))
+    s = jnp.where(jnp.any(crosses), lengths[jnp.argmin(merits)], jnp.ones_like(lengths[0]))
+    stops = jnp.any(crosses) & (merit(1, jnp.ones_like(s)) <= jnp.min(merits))
+    reached = jnp.where(stops, jnp.where(crosses, jnp.zeros_like(over), over + dtheta), over + s * dtheta)
+    pushed = jnp.where(stops, pushes[1], s * pushes[0])
+    zero, full = jnp.zeros_like(h), jnp.broadcast_to(latent.latent, h.shape)
+    h = jnp.where(reached > 0, full, jnp.where(reached < 0, zero, jnp.clip(h + missing - pushed, zero, full)))
     return _kept(flow, y, reached + h / flow.capacity)
 
 

@@ -57,6 +57,7 @@ _HOMES = {
     "forces.pair_laws": ("LennardJones", "PairLaw", "SlideLaw", "UnitVectorLaw", "gentle_fluid"),
     "forces.cutoffs": ("Cutoff", "NoCutoff", "PlainCutoff", "ShiftedForce", "Switched"),
     "forces.pairs": ("AllPairs", "Pairs"),
+    "forces.neighbour_list": ("NeighbourList",),
     "forces.pair_drag": ("PairDrag",),
     "forces.molten": ("Molten",),
     "forces.fluid": ("Fluid",),

@@ -77,7 +77,7 @@ def test_f3_steps_of_any_length(scheme, rng):
 
 
 def test_f4_conductivity_and_capacity_at_their_ends():
-    """F4: an infinite conductivity and a capacity of zero are refused, zero conductivity insulates, and a cut link is cut though infinite."""
+    """F4: an infinite conductivity and a capacity of zero are refused, no conductivity insulates, a cut link is cut though infinite."""
     net = js.lattice(4)
     with pytest.raises(ValueError, match=r"conductivity\[2\] = inf"):
         js.conductances(net, [1.0, 1.0, np.inf, 1.0], 1.0)

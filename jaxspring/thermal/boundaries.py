@@ -236,10 +236,12 @@ class Radiation(ThermalBoundary):
         self.area = _nonnegative(net, "area", area)
 
     def power(self, state: State, temperature: Array) -> Array:
-        """E sigma A (theta_a^4 - theta^4) [W]."""
+        """E sigma A (theta_a^4 - theta^3 abs(theta)) [W]."""
         ambient = at_time(self.ambient, state.time, temperature)
         # A product of differences: no digit is lost where the two are near.
         difference = (ambient - temperature) * (ambient + temperature) * (ambient**2 + temperature**2)
+        # Below zero, where a step too long may lead, the odd power still pulls back: heat falls as temperature rises, everywhere.
+        difference = jnp.where(temperature < 0, ambient**4 + temperature**4, difference)
         return self._factor(temperature) * difference
 
     def slope(self, state: State, temperature: Array) -> Array:

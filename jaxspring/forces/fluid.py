@@ -100,6 +100,16 @@ class Fluid(Force):
         """The same fluid of these masses [kg]."""
         return eqx.tree_at(lambda f: f.mass, self, mass, is_leaf=lambda leaf: leaf is None)
 
+    def with_forces(self, forces: tuple[Force, ...]) -> Fluid:
+        """The same; refuses a second list, for which a state has no place.
+
+        Raises:
+            ValueError: two fluids with neighbour lists in one system.
+        """
+        if self.pairs.needs_reach and sum(isinstance(f, Fluid) and f.pairs.needs_reach for f in forces) > 1:
+            raise ValueError("two fluids of this system have a NeighbourList, but a state keeps one list. Give one of them AllPairs().")
+        return self
+
     def force(self, state: State) -> Vector:
         """Force on each node [N]."""
         return Vector(self._sum(state, lambda terms: terms.force, state.dim, self.drag is not None))
@@ -207,5 +217,5 @@ class Fluid(Force):
 
     def _mass(self, state: State) -> Array:
         if self.mass is None:
-            raise ValueError("Fluid has no masses yet. Put it in a System.")
+            raise ValueError("Fluid has no masses yet. Put it in a System and ask that, or the forces of system.prepare(state.dtype).")
         return jnp.broadcast_to(self.mass.astype(state.dtype), state.position.shape)

@@ -70,7 +70,7 @@ class PairTerms(eqx.Module):
     particles: Particles
 
     def force(self, own: Fields, other: Fields, distinct: Array) -> Fields:
-        """Force on the own particle [N], one array per coordinate. A pair of a particle with itself gives zero."""
+        """Force on the own particle [N], one array per coordinate."""
         a, b = self.particles.like(own), self.particles.like(other)
         d, squared = _difference(a, b)
         guarded = jnp.maximum(squared, self.core * self.core)
@@ -78,6 +78,8 @@ class PairTerms(eqx.Module):
         if self.drag is not None and a.velocity:
             approach = sum((u - v) * along for u, v, along in zip(a.velocity, b.velocity, d, strict=True))
             weight = weight - self._takes_part(a, b, self.drag.rate(guarded) * approach / guarded)
+        # A particle with itself has d = 0, but its weight is the core's: in reverse mode two huge terms would cancel only to rounding.
+        weight = _if_distinct(distinct, weight)
         return tuple(weight * along for along in d)
 
     def energy(self, own: Fields, other: Fields, distinct: Array) -> Fields:

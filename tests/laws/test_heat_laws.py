@@ -48,12 +48,14 @@ def test_heat_is_kept(scheme, melts, seed, log_dt, log_latent, heated):
     rng, c, g, t = body(seed)
     latent = js.LatentHeat(350.0, jnp.asarray(10**log_latent)) if melts else None
     q = jnp.asarray(rng.normal(size=12) * heated)
-    _, end, (before, after), given_heat = run(scheme, NET, c, g, t, latent, q, jnp.asarray(10**log_dt))
+    status, end, (before, after), given_heat = run(scheme, NET, c, g, t, latent, q, jnp.asarray(10**log_dt))
     scale = float(before) + float(jnp.sum(jnp.abs(q))) * 5 * 10**log_dt
     # Half an explicit step of Crank-Nicolson moves up to dt G theta about, whose rounding is kept.
     moved = 10**log_dt * 1e3 * 100 if isinstance(scheme, js.CrankNicolsonHeat) else 0.0
     assert abs(float(after - before - given_heat)) <= 1e-12 * (scale + moved)
     assert np.all(np.isfinite(end))
+    if log_dt < 0:
+        assert not bool(status.has(Flag.SOLVER))
 
 
 @pytest.mark.slow

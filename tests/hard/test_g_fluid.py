@@ -196,3 +196,9 @@ def test_g10_list_equals_all_pairs(dim, dtype, rng):
     assert np.abs(ours - exact).max() < tolerance * np.abs(exact).max()
     assert int(needed) <= 80
     assert float(energy) == pytest.approx(float(exact_energy), rel=tolerance * 10)
+
+
+def test_g8_no_particle_at_all():
+    """A net without a node is refused when it is built, so that no fluid can be on it."""
+    with pytest.raises(ValueError, match="n_nodes = 0"):
+        make(np.zeros((0, 2)))

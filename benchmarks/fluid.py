@@ -5,8 +5,8 @@
 Lennard-Jones, its force shifted to zero at 2.5 sigma, skin 0.3, liquid density 0.8, float32, 1e3 to 1e5 particles in open space. Beside it,
 where they are installed: jax-md, Warp's hash grid, a list in numba. Read: `M` is million pairs within the cut-off a second, each counted
 once, the median of interleaved rounds; `error` is the largest difference from the float64 sum over all pairs, over the largest force.
-In full steps (velocity Verlet, speeds of temperature 1) the list is remade when it must be; `rebuilds` says how often, `build` how many forces
-one costs.
+In full steps (velocity Verlet, speeds of temperature 1) the list is remade when it must be; `rebuilds` says how often, `build`
+how many forces one costs.
 """
 
 from __future__ import annotations

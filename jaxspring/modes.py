@@ -206,7 +206,7 @@ def _linearised(system: System, state: State, *, with_damping: bool) -> tuple[Ar
 
     def force(moved: Array, moving: Array) -> Array:
         x, v = (Vector(tuple(layout.unflatten(a[:, i]) for i in range(dim))) for a in (moved, moving))
-        f = system.force(State(state.time, state.position + x, v, layout))
+        f = system.force(state.moved(state.position + x, v))
         return jnp.stack([layout.flatten(a) for a in f], axis=-1)
 
     _, change = jax.linearize(force, zero, zero)
@@ -220,7 +220,7 @@ def _linearised(system: System, state: State, *, with_damping: bool) -> tuple[Ar
 
 
 def _at_rest(state: State, position: Vector) -> State:
-    return State(state.time, position, Vector.zeros_like(position), state.layout)
+    return state.moved(position, Vector.zeros_like(position))
 
 
 def _count_free(system: System, state: State) -> int:

@@ -133,6 +133,25 @@ batching.primitive_batchers[_linear_call] = _batch
 mlir.register_lowering(_linear_call, mlir.lower_fun(_evaluate, multiple_results=True))
 
 
+def any_lane(flag: Array) -> Array:
+    """`flag`, a 0-d bool, and under `vmap` whether it holds in any lane: one value for all lanes.
+
+    A `lax.cond` on it stays a conditional under `vmap`, where one on a value per lane would run both branches.
+    """
+    return _any_lane.bind(flag)
+
+
+def _reduce_lanes(args: tuple[Array], dims: tuple[int]) -> tuple[Array, Any]:
+    return any_lane(jnp.any(args[0], axis=dims[0])), batching.not_mapped
+
+
+_any_lane = Primitive("jaxspring_any_lane")
+_any_lane.def_impl(lambda flag: flag)
+_any_lane.def_abstract_eval(lambda flag: ShapedArray(flag.shape, flag.dtype))
+batching.primitive_batchers[_any_lane] = _reduce_lanes
+mlir.register_lowering(_any_lane, mlir.lower_fun(lambda flag: flag, multiple_results=False))
+
+
 def cast_inexact(tree: PyTree, dtype: Any) -> PyTree:
     """Cast every inexact array leaf of `tree` to `dtype`, leaving integers, booleans and non-arrays alone."""
 
@@ -158,4 +177,4 @@ def is_traced(*trees: PyTree) -> bool:
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
 
 
-__all__ = ["Array", "cast_inexact", "is_traced", "linear_call", "stopped", "tied", "tiny"]
+__all__ = ["Array", "any_lane", "cast_inexact", "is_traced", "linear_call", "stopped", "tied", "tiny"]

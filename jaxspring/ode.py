@@ -7,6 +7,7 @@ Held nodes have derivative zero and stay exactly where they are. Nodes on a sche
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, get_origin
 
@@ -71,7 +72,7 @@ class OdeResult(eqx.Module):
             raise ValueError("this result keeps no interpolation. Pass saveat=diffrax.SaveAt(dense=True) to diffeqsolve.")
         time = jnp.asarray(time, self.state.dtype)
         position, velocity = self.info.interpolation.evaluate(time)
-        return State(time, position, velocity, self.state.layout)
+        return self.state.moved(position, velocity, time)
 
 
 def diffeqsolve(
@@ -105,7 +106,8 @@ def diffeqsolve(
         An `OdeResult`. Trouble is in its status, never an exception: NONFINITE, MAX_STEPS, SOLVER; call `raise_for_status(result)`.
 
     Raises:
-        ValueError: times that are not finite or of the wrong sign; options that do not fit together.
+        ValueError: times that are not finite or of the wrong sign; options that do not fit together; a system with rules, which
+            need fixed steps.
         TypeError: a solver that wants the right-hand side split: implicit-explicit or stochastic.
 
     >>> net = js.lattice(2)
@@ -118,6 +120,9 @@ def diffeqsolve(
 
     solver = diffrax.Tsit5() if solver is None else solver
     _check_times(state, t1, dt0)
+    if system.rules:
+        names = ", ".join(type(rule).__name__ for rule in system.rules)
+        raise ValueError(f"{names} acts after steps of fixed length, which an adaptive solver does not take. Use rollout.")
     t1 = jnp.asarray(t1, state.dtype)
     dt0 = None if dt0 is None else jnp.asarray(dt0, state.dtype)
     if stepsize_controller is None:
@@ -157,7 +162,7 @@ def _solve(
         t1,
         dt0,
         (start.position, start.velocity),
-        args=ready,
+        args=_Scene(ready, dataclasses.replace(start, position=None, velocity=None)),
         saveat=diffrax.SaveAt(subs=end) if saveat is None else _with_end(saveat, end),
         stepsize_controller=controller,
         adjoint=adjoint,
@@ -167,7 +172,7 @@ def _solve(
     )
     found: Any = solution
     times, frames = (found.ts, found.ys) if saveat is None else (found.ts[1], found.ys[1])
-    last = _as_state(times[0], jax.tree.map(lambda a: a[0], frames), ready)
+    last = _as_state(times[0], jax.tree.map(lambda a: a[0], frames), _Scene(ready, start))
     names = ("num_steps", "num_accepted_steps", "num_rejected_steps")
     n_steps, n_accepted, n_rejected = (jnp.asarray(found.stats[name], jnp.int32) for name in names)
     status = before.then(look(ready, Carry(last, None, n_steps))).then(_verdict(solution.result, n_steps))
@@ -177,26 +182,33 @@ def _solve(
         times=None if saveat is None else found.ts[0],
         status=jax.lax.stop_gradient(status),
         info=OdeInfo(n_steps, n_accepted, n_rejected, solution.result, solution.interpolation),
-        effects=tuple(type(force).__name__ for force in system.forces),
+        effects=system.effects,
     )
 
 
-def _as_state(time: Array, y: Y, system: System) -> State:
-    return system.constrain(State(time.astype(y[0].dtype), *y, system.net.layout))
+class _Scene(eqx.Module):
+    """The system, and a state that holds all that does not move."""
+
+    system: System
+    like: State
 
 
-def _flow(time: Any, y: Any, system: Any) -> Any:
+def _as_state(time: Array, y: Y, scene: _Scene) -> State:
+    return scene.system.constrain(scene.like.moved(*y, time.astype(y[0].dtype)))
+
+
+def _flow(time: Any, y: Any, scene: Any) -> Any:
     """Dy/dt. Module-level, so that diffrax compiles it once."""
-    state = _as_state(time, y, system)
-    return state.velocity, system.acceleration(state)
+    state = _as_state(time, y, scene)
+    return state.velocity, scene.system.acceleration(state)
 
 
-def _drift(time: Any, velocity: Any, system: Any) -> Any:
-    return system.hold(velocity)
+def _drift(time: Any, velocity: Any, scene: Any) -> Any:
+    return scene.system.hold(velocity)
 
 
-def _kick(time: Any, position: Any, system: Any) -> Any:
-    return _flow(time, (position, Vector.zeros_like(position)), system)[1]
+def _kick(time: Any, position: Any, scene: Any) -> Any:
+    return _flow(time, (position, Vector.zeros_like(position)), scene)[1]
 
 
 def _terms(system: System, state: State, solver: Any) -> Any:
@@ -236,8 +248,8 @@ class _OfState(eqx.Module):
 
     function: Callable[[Array, Any, Any], Any]
 
-    def __call__(self, time: Array, y: Y, system: System) -> Any:
-        return self.function(time, _as_state(time, y, system), system)
+    def __call__(self, time: Array, y: Y, scene: _Scene) -> Any:
+        return self.function(time, _as_state(time, y, scene), scene.system)
 
 
 def _with_end(saveat: Any, end: Any) -> Any:

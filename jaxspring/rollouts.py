@@ -82,7 +82,7 @@ class Result(eqx.Module):
         status: what went wrong, if anything; see `raise_for_status`.
         info: facts about the run.
         resume: for going on bit for bit.
-        effects: names of the system's forces, for messages (static).
+        effects: names of the system's forces and rules, for messages (static).
     """
 
     state: State
@@ -174,7 +174,7 @@ class _Begun(eqx.Module):
 
 def _begin(system: System, state: State, resume: Resume, job: _Job) -> _Begun:
     ready = system.prepare(state.dtype)
-    start = ready.constrain(state)
+    start = ready.begin(state)
     still, still_start = stopped((ready, start))
     limit = dt_limit(still, still_start, job.stepper)
     memory = job.stepper.init(ready, start) if isinstance(resume.memory, _Unset) else resume.memory
@@ -188,7 +188,8 @@ def _proceed(begun: _Begun, job: _Job, progress: Progress | None = None) -> Resu
     still, info = stopped(ready), job.stepper.report(resume.memory)
     if job.keep_solves and (info is None or job.plan.save_every is None):
         raise ValueError("keep_solves keeps how an implicit stepper's solves ended in each frame: pass save_every and an implicit stepper.")
-    carry = Carry(begun.state, resume.memory, resume.step, None if info is None else Solves.none(info))
+    found = Status.ok() if ready.followers else None
+    carry = Carry(begun.state, resume.memory, resume.step, None if info is None else Solves.none(info), found)
 
     advance = partial(_advance, ready, job.stepper, job.dt, resume.start_time)
 
@@ -207,13 +208,15 @@ def _proceed(begun: _Begun, job: _Job, progress: Progress | None = None) -> Resu
         # An implicit step looks at itself, so that nothing need be replayed. What was wrong before the first step comes first.
         at_start = status.step == 0
         status = status.only_if(at_start).then(carry.solves.status).then(status.only_if(~at_start))
+    if carry.found is not None:
+        status = status.then(carry.found)
     return Result(
         state=carry.state,
         saved=saved,
         status=_in_user_order(status, begun.state),
         info=Info(limit, carry.step, carry.solves, solves_saved),
         resume=Resume(resume.start_time, carry.step, carry.memory),
-        effects=tuple(type(f).__name__ for f in ready.forces),
+        effects=ready.effects,
     )
 
 
@@ -237,7 +240,12 @@ def _advance(system: System, stepper: Stepper, dt: Array, start_time: Array, car
     state = eqx.tree_at(lambda s: s.time, state, start_time + index.astype(dt.dtype) * dt)
     info = stopped(stepper.report(memory))
     solves = carry.solves if carry.solves is None or info is None else carry.solves.then(info, index)
-    return Carry(state if system.motion is None else system.constrain(state), memory, index, solves)
+    state = state if system.motion is None else system.constrain(state)
+    if carry.found is None:
+        return Carry(state, memory, index, solves)
+    state, status = system.follow(carry.state, state, dt)
+    status = stopped(eqx.tree_at(lambda s: s.step, status, jnp.where(status.flags != 0, index, status.step)))
+    return Carry(state, memory, index, solves, carry.found.then(status))
 
 
 _compiled = eqx.filter_jit(_run)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ._checks import as_inexact
+from ._checks import as_inexact, finite, has_shape
 from .topology.base import NodeLayout, Topology
+from .topology.edge_field import EdgeField
 from .vector import Vector
 
 
@@ -21,15 +23,29 @@ class State(eqx.Module):
         position: `Vector` in node shape [m].
         velocity: `Vector` in node shape [m/s].
         layout: how node fields are stored (static).
+        temperature: node shape [K], or None where the scene has no heat.
+        enthalpy: heat that melting has taken up, of each node [J], or None without latent heat.
+        alive: bool edge field of the system's net, False where a spring has broken; None where springs do not break.
+        rest_length: edge field [m] of rest lengths that have changed for good, or None.
+        neighbours: the list that short-ranged pair forces reuse, or None.
+        ledger: what the energy went into so far, or None where nobody asked.
+
+    What is None is not there: it costs nothing, and its effect is not in the scene.
     """
 
     time: Array
     position: Vector
     velocity: Vector
     layout: NodeLayout = eqx.field(static=True)
+    temperature: Array | None = None
+    enthalpy: Array | None = None
+    alive: EdgeField | None = None
+    rest_length: EdgeField | None = None
+    neighbours: Any = None
+    ledger: Any = None
 
     @staticmethod
-    def from_points(net: Topology, points: Any, velocities: Any = None, time: Any = 0.0) -> State:
+    def from_points(net: Topology, points: Any, velocities: Any = None, time: Any = 0.0, temperature: Any = None) -> State:
         """A state from (N, D) arrays in the user's node order.
 
         Args:
@@ -37,6 +53,7 @@ class State(eqx.Module):
             points: (N, D) positions [m], D = 1, 2 or 3. Integers are converted to the default float.
             velocities: (N, D) velocities [m/s]; None is at rest.
             time: [s].
+            temperature: [K]: one number, or (N,) in the user's order; None where the scene has no heat.
 
         Raises:
             ValueError: a wrong shape, or a NaN or infinity, named with its index.
@@ -49,7 +66,17 @@ class State(eqx.Module):
             velocity = net.vector_field(as_inexact("velocities", velocities, position.dtype), "velocities")
             if velocity.dim != position.dim:
                 raise ValueError(f"velocities have {velocity.dim} coordinates, points have {position.dim}.")
-        return State(jnp.asarray(time, position.dtype), position, velocity, net.layout)
+        if temperature is not None:
+            temperature = as_inexact("temperature", temperature, position.dtype)
+            has_shape("temperature", temperature, {"one number": (), "one per node": (net.n_nodes,), "node shape": net.node_shape})
+            finite("temperature", temperature)
+            temperature = jnp.broadcast_to(net.node_field(temperature, "temperature"), net.node_shape)
+        return State(jnp.asarray(time, position.dtype), position, velocity, net.layout, temperature)
+
+    def moved(self, position: Vector, velocity: Vector, time: Array | None = None) -> State:
+        """The state at another place, velocity and (where given) time, all else as it is."""
+        time = self.time if time is None else time
+        return dataclasses.replace(self, time=time, position=position, velocity=velocity)
 
     @property
     def points(self) -> Array:
@@ -60,6 +87,13 @@ class State(eqx.Module):
     def velocities(self) -> Array:
         """(..., N, D) velocities [m/s] in the user's node order."""
         return jnp.stack([self.layout.flatten(a) for a in self.velocity], axis=-1)
+
+    @property
+    def temperatures(self) -> Array:
+        """(..., N) temperatures [K] in the user's node order."""
+        if self.temperature is None:
+            raise ValueError("this state has no temperature. Pass temperature=... to State.from_points.")
+        return self.layout.flatten(self.temperature)
 
     @property
     def dtype(self) -> jnp.dtype:

@@ -55,7 +55,7 @@ EXPLANATION = {
     Flag.COINCIDENT: "the ends of a spring with a rest length coincide, so its direction is undefined and its pull was taken as zero",
     Flag.OVERLAP: "particles overlap; their repulsion was capped",
     Flag.OUTSIDE: "nodes lie outside the image and take its border value",
-    Flag.NEIGHBOUR_OVERFLOW: "the neighbour list is too small; raise its capacity",
+    Flag.NEIGHBOUR_OVERFLOW: "the neighbour list is too small, nothing was left out; raise its capacity to the count or more",
     Flag.MAX_STEPS: "the adaptive solver ran out of steps; raise max_steps or loosen the tolerance",
     Flag.INTERRUPTED: "interrupted; the result holds what was done until then",
     Flag.DT_LIMIT: "dt is above the stability limit of this stepper (see stable_dt)",

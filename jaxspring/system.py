@@ -17,11 +17,12 @@ import numpy as np
 from jaxtyping import Array
 
 from ._checks import as_inexact, has_shape, positive, shape_of
-from .forces.base import Force
+from .forces.base import Force, Rule
 from .forces.linearisation import Linearisation
 from .linalg.operators import Blocks, SpringMatrix
 from .numerics import cast_inexact
 from .state import State
+from .status import Status
 from .topology.base import Topology
 from .vector import Vector
 
@@ -70,6 +71,7 @@ class System(eqx.Module):
         forces: the effects of the scene, in the order of their indices in statuses.
         free: None (all move), a bool node array, or one per coordinate: False is held at its place, exactly.
         motion: nodes moved by a schedule, or None.
+        rules: what happens after each step besides motion, in this order: heat, breaking, contact. None where there are none.
     """
 
     net: Topology
@@ -77,24 +79,28 @@ class System(eqx.Module):
     forces: tuple[Force, ...]
     free: Free
     motion: Motion | None
+    rules: tuple[Rule, ...] | None
 
-    def __init__(self, net: Topology, mass: Any, forces: Any = (), free: Any = None, motion: Motion | None = None):
+    def __init__(self, net: Topology, mass: Any, forces: Any = (), free: Any = None, motion: Motion | None = None, rules: Any = ()):
         """Args:
             net: the topology.
             mass: [kg]: a number, or (N,) in the user's order.
             forces: the effects; a single force is taken as a tuple of one.
             free: None, (N,) or (N, D) booleans in the user's order; False holds a node, or one coordinate of it.
             motion: nodes moved by a schedule (they count as not free).
+            rules: what happens after each step besides motion; a single rule is taken as a tuple of one.
 
         Raises:
             ValueError: a mass that is not positive (named with its node), a wrong shape, forces on another topology.
-            TypeError: something in `forces` that is not a `Force`; `free` that is not boolean.
+            TypeError: something in `forces` that is not a `Force`, in `rules` that is not a rule; `free` that is not boolean.
         """
         mass = as_inexact("mass", mass)
         positive("mass", mass, "A node without mass would get an infinite acceleration.")
         self.net = net
         self.mass = net.node_field(mass, "mass")
         self.forces = tuple(self._adopt(i, f) for i, f in enumerate((forces,) if isinstance(forces, Force) else forces))
+        # None, not an empty tuple, which some transformations of equinox and diffrax mistake for an array.
+        self.rules = tuple(self._adopt_rule(i, r) for i, r in enumerate((rules,) if isinstance(rules, Rule) else rules)) or None
         self.free = _as_free(net, free)
         self.motion = motion
 
@@ -105,16 +111,55 @@ class System(eqx.Module):
     def _adopt(self, i: int, force: Any) -> Force:
         if not isinstance(force, Force):
             raise TypeError(f"forces[{i}] is a {type(force).__name__}; expected a Force, e.g. Springs(net, ...) or Drag(gamma).")
-        other = getattr(force, "net", None)
+        return self._on_this_net(f"forces[{i}]", force)
+
+    def _adopt_rule(self, i: int, rule: Any) -> Rule:
+        if not isinstance(rule, Rule) or isinstance(rule, Force):
+            raise TypeError(f"rules[{i}] is a {type(rule).__name__}; expected a rule, e.g. Heat(net, ...); forces belong to `forces`.")
+        return self._on_this_net(f"rules[{i}]", rule)
+
+    def _on_this_net(self, name: str, effect: Any) -> Any:
+        other = getattr(effect, "net", None)
         if other is not None and (other.node_shape != self.net.node_shape or other.node_permutation != self.net.node_permutation):
-            raise ValueError(f"forces[{i}] ({type(force).__name__}) was built on another topology than the system.")
-        return force
+            raise ValueError(f"{name} ({type(effect).__name__}) was built on another topology than the system.")
+        return effect
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Names of forces and rules, in the order of their indices in a status."""
+        return tuple(type(effect).__name__ for effect in (*self.forces, *(self.rules or ())))
+
+    @property
+    def followers(self) -> tuple[tuple[int, Rule], ...]:
+        """Whatever acts after a step, with its index in a status: forces that keep a memory, then the rules."""
+        n = len(self.forces)
+        return (*((i, f) for i, f in enumerate(self.forces) if f.is_rule), *((n + i, r) for i, r in enumerate(self.rules or ())))
+
+    def begin(self, state: State) -> State:
+        """The constrained state with the memory that forces and rules need."""
+        state = self.constrain(state)
+        for _, rule in self.followers:
+            state = rule.begin(state)
+        return state
+
+    def follow(self, before: State, state: State, dt: Array) -> tuple[State, Status]:
+        """What happens after a step besides motion, and what went wrong there."""
+        total = Status.ok()
+        for i, rule in self.followers:
+            state, status = rule.update(before, state, dt)
+            placed = jnp.where(status.flags != 0, jnp.asarray(i, jnp.int32), status.effect)
+            total = total.then(eqx.tree_at(lambda s: s.effect, status, placed))
+        return state, total
 
     def prepare(self, dtype: Any) -> System:
         """The system as a loop wants it: every constant in the shape of the topology and of `dtype`."""
-        ready = tuple(f.with_mass(self.mass).prepare(dtype) for f in self.forces)
-        forces = tuple(f.with_forces(ready) for f in ready)
-        return cast_inexact(eqx.tree_at(lambda s: s.forces, self, forces), dtype)
+        alone = tuple(f.with_mass(self.mass).prepare(dtype) for f in self.forces)
+        forces = tuple(f.with_forces(alone) for f in alone)
+        ready = eqx.tree_at(lambda s: s.forces, self, forces)
+        if self.rules:
+            rules = tuple(r.with_mass(self.mass).with_forces(forces).prepare(dtype) for r in self.rules)
+            ready = eqx.tree_at(lambda s: s.rules, ready, rules)
+        return cast_inexact(ready, dtype)
 
     def force(self, state: State) -> Vector:
         """Sum of all forces on each node [N], also where it is held (there it is what the hold must balance)."""

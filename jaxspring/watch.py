@@ -56,12 +56,15 @@ class Solves(eqx.Module):
 
 
 class Carry(eqx.Module):
-    """What goes from step to step: the state, what the stepper carries, how many steps were done, and how its solves went."""
+    """What goes from step to step: the state, what the stepper carries, how many steps were done, how its solves went, and what the
+    system's rules found.
+    """
 
     state: State
     memory: Any
     step: Array
     solves: Solves | None = None
+    found: Status | None = None
 
 
 def begin(system: System, ready: System, carry: Carry, dt: Array, limit: Array | None) -> Status:
@@ -73,12 +76,12 @@ def begin(system: System, ready: System, carry: Carry, dt: Array, limit: Array |
     # Masses first: gravity holds them too, and would be blamed.
     status = Status.when(Flag.INVALID, ~jnp.all(system.mass > 0), step=carry.step)
     status = status.then(Status.when(Flag.NONFINITE, _has_nonfinite(system.mass), step=carry.step))
-    for i, effect in enumerate(system.forces):
+    for i, effect in enumerate((*system.forces, *(system.rules or ()))):
         bad = effect.invalid()
         if bad is not None:
             status = status.then(Status.when(Flag.INVALID, bad, step=carry.step, effect=i))
         status = status.then(Status.when(Flag.NONFINITE, _has_nonfinite(effect), step=carry.step, effect=i))
-        rounding = ready.forces[i].rounding(carry.state)
+        rounding = ready.forces[i].rounding(carry.state) if i < len(ready.forces) else None
         if rounding is not None:
             # Forces good to three digits or worse: the threshold is a choice.
             status = status.then(Status.when(Flag.PRECISION, rounding > 1e-3, step=carry.step, effect=i))
@@ -102,7 +105,7 @@ def look(system: System, carry: Carry) -> Status:
     bad = _nonfinite(state)
     node = jnp.argmax(jnp.ravel(bad))
     status = Status.when(Flag.NONFINITE, jnp.any(bad), step=carry.step, node=node, count=jnp.sum(bad))
-    for i, effect in enumerate(system.forces):
+    for i, effect in enumerate((*system.forces, *(system.rules or ()))):
         for found in effect.diagnose(state):
             raised = Status.when(found.flag, found.count > 0, step=carry.step, node=found.node, effect=i, count=found.count)
             status = status.then(raised)
@@ -145,6 +148,7 @@ def _has_nonfinite(constants: Any) -> Array:
 
 def _nonfinite(state: State) -> Array:
     bad = [~jnp.isfinite(a) for v in (state.position, state.velocity) for a in v]
+    bad += [] if state.temperature is None else [~jnp.isfinite(state.temperature)]
     total = bad[0]
     for more in bad[1:]:
         total = total | more

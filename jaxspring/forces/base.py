@@ -1,5 +1,7 @@
 """What a force is: a function of the state, with what the system may ask of it.
 
+A rule is what happens to a state besides motion, after each step: heat flows, springs break.
+
 Write your own by subclassing `Force`: `force` alone is enough. `energy` closes the ledger, `stiffness_bound` serves `stable_dt`, and
 `diagnose` tells what it saw when the status is taken.
 """
@@ -7,7 +9,7 @@ Write your own by subclassing `Force`: `force` alone is enough. `energy` closes 
 from __future__ import annotations
 
 import abc
-from typing import Any
+from typing import Any, Self
 
 import equinox as eqx
 import jax
@@ -17,7 +19,7 @@ from jaxtyping import Array
 from ..linalg.operators import Blocks
 from ..numerics import cast_inexact
 from ..state import State
-from ..status import Flag
+from ..status import Flag, Status
 from ..vector import Vector
 from .linearisation import Linearisation
 
@@ -36,28 +38,63 @@ class Finding(eqx.Module):
     node: Array
 
 
-class Force(eqx.Module):
-    """A force on the nodes. Abstract; `Springs`, `Drag`, `Gravity` and the others are final."""
+class Rule(eqx.Module):
+    """What happens to a state after each step, besides motion. Abstract.
+
+    Rules run in the order in which the system names them, each on the state that the one before left.
+    """
+
+    def begin(self, state: State) -> State:
+        """The state with the memory that this rule needs, made where it is not there yet. Called before the first step."""
+        return state
+
+    def update(self, before: State, state: State, dt: Array) -> tuple[State, Status]:
+        """The state after a step of `dt` [s] that began at `before` and moved the nodes to `state`, and what went wrong."""
+        return state, Status.ok()
+
+    def limit(self, state: State) -> Array | None:
+        """Largest stable dt [s]; None where nothing limits it."""
+        return None
+
+    def prepare(self, dtype: Any) -> Self:
+        """The same with every constant in the shape and dtype that the loop wants. Called once, before the loop."""
+        return cast_inexact(self, dtype)
+
+    def with_mass(self, mass: Array) -> Self:
+        """The same, knowing the node masses [kg]; only what needs them answers with another object."""
+        return self
+
+    def with_forces(self, forces: tuple[Force, ...]) -> Self:
+        """The same, knowing all forces of its system; only what needs them answers with another object."""
+        return self
+
+    def diagnose(self, state: State) -> tuple[Finding, ...]:
+        """What this effect has to report about a state: see `Finding`."""
+        return ()
+
+    def invalid(self) -> Array | None:
+        """Whether a constant has a value that the constructor would refuse (for values that were traced then, or changed since)."""
+        return None
+
+
+class Force(Rule):
+    """A force on the nodes. Abstract; `Springs`, `Drag`, `Gravity` and the others are final.
+
+    A force may act as a rule, too: one that keeps a list up to date gives `begin` and `update`, and says so in `is_rule`.
+    """
 
     @abc.abstractmethod
     def force(self, state: State) -> Vector:
         """Force on each node [N], in node shape."""
 
+    @property
+    def is_rule(self) -> bool:
+        """Whether `begin` and `update` are to be called."""
+        return False
+
     def energy(self, state: State) -> Array | None:
         """Potential energy [J], or None where the force has no potential."""
         return None
-
-    def prepare(self, dtype: Any) -> Force:
-        """The same force with every constant in the shape and dtype that the loop wants. Called once, before the loop."""
-        return cast_inexact(self, dtype)
-
-    def with_mass(self, mass: Array) -> Force:
-        """The force acting on these node masses [kg]; only forces that need them answer with another object."""
-        return self
-
-    def with_forces(self, forces: tuple[Force, ...]) -> Force:
-        """The force knowing all forces of its system; only forces that need them answer with another object."""
-        return self
 
     def stiffness_blocks(self, state: State, linearisation: Linearisation) -> Blocks | None:
         """-dF/dx [N/m] as blocks of nodes and springs, for implicit steps; None: taken at the old time there."""
@@ -95,14 +132,6 @@ class Force(eqx.Module):
 
     def rounding(self, state: State) -> Array | None:
         """Rounding error of a position, relative to the smallest length that the effect must resolve; None where it takes no difference."""
-        return None
-
-    def diagnose(self, state: State) -> tuple[Finding, ...]:
-        """What this effect has to report about a state: see `Finding`."""
-        return ()
-
-    def invalid(self) -> Array | None:
-        """Whether a constant has a value that the constructor would refuse (for values that were traced then, or changed since)."""
         return None
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import abc
 from functools import partial
-from typing import Any
+from typing import Any, TypeGuard
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -39,6 +39,11 @@ class StiffnessRule(eqx.Module):
     def upper_bound(self) -> Array:
         """The largest stiffness the rule can give [N/m], for `stable_dt`."""
 
+    @property
+    def follows_position(self) -> bool:
+        """Whether the stiffness depends on where the nodes are; the springs then have no potential."""
+        return True
+
     def invalid(self) -> Array | None:
         """Whether a constant has a value that the constructor would refuse."""
         return None
@@ -46,6 +51,18 @@ class StiffnessRule(eqx.Module):
     def prepare(self, net: Topology, dtype: Any) -> StiffnessRule:
         """The rule as the loop wants it: constants cast, tables made. Called once, before the loop."""
         return cast_inexact(self, dtype)
+
+
+class ExpansionRule(eqx.Module):
+    """By what factor rest lengths have grown in a state; the positions have no part in it. Abstract."""
+
+    @abc.abstractmethod
+    def factor(self, net: Topology, state: State) -> EdgeField:
+        """Present rest length over that of the reference, per spring."""
+
+    def invalid(self) -> Array | None:
+        """Whether a constant has a value that the constructor would refuse."""
+        return None
 
 
 class Springs(Force):
@@ -58,6 +75,10 @@ class Springs(Force):
         law: the law of one spring; `Hooke()` unless said.
         axes: the coordinates the springs act in (None: all). `axes=(0, 1)` makes springs of the projection on the plane.
         allow_negative_stiffness: accept stiffnesses below zero, which push without bound.
+        expansion: an `ExpansionRule` that multiplies the rest lengths, or None.
+
+    A state whose `alive` or `rest_length` has the shape of this net's springs is heeded: a broken spring does nothing, and rest lengths
+    that have changed take the place of the given ones.
 
     Raises:
         ValueError: a negative or non-finite constant (named with its index), a shape that fits neither one number nor one per spring.
@@ -69,6 +90,7 @@ class Springs(Force):
     law: Law
     axes: tuple[int, ...] | None = eqx.field(static=True)
     allow_negative_stiffness: bool = eqx.field(static=True)
+    expansion: ExpansionRule | None
 
     def __init__(
         self,
@@ -78,6 +100,7 @@ class Springs(Force):
         law: Law | None = None,
         axes: tuple[int, ...] | None = None,
         allow_negative_stiffness: bool = False,
+        expansion: ExpansionRule | None = None,
     ):
         self.net = net
         self.stiffness = stiffness if isinstance(stiffness, StiffnessRule) else _edge_constant(net, "stiffness", stiffness)
@@ -85,6 +108,7 @@ class Springs(Force):
         self.law = Hooke() if law is None else law
         self.axes = None if axes is None else tuple(int(a) for a in axes)
         self.allow_negative_stiffness = allow_negative_stiffness
+        self.expansion = expansion
         if not isinstance(stiffness, StiffnessRule):
             why = "A negative stiffness pushes without bound. Pass allow_negative_stiffness=True if meant."
             _check_sign("stiffness", self.stiffness, why, any_sign=allow_negative_stiffness)
@@ -117,7 +141,7 @@ class Springs(Force):
         """Sum of the springs' energies [J]; None where the law has none."""
         if self.net.n_springs == 0:
             return jnp.zeros((), state.dtype)
-        if isinstance(self.stiffness, StiffnessRule):
+        if self._follows_position:
             return None
         one = jnp.ones((), state.dtype)
         if self.law.energy(one, one, one) is None:
@@ -136,7 +160,11 @@ class Springs(Force):
 
     def is_symmetric(self, state: State) -> bool:
         """Central forces are, unless the stiffness depends on position."""
-        return not isinstance(self.stiffness, StiffnessRule)
+        return not self._follows_position
+
+    def can_feed(self, state: State) -> bool:
+        """Whether stiffness or rest length follow the state, or the law has no potential."""
+        return isinstance(self.stiffness, StiffnessRule) or self.expansion is not None or self.energy(state) is None
 
     def tension(self, state: State) -> EdgeField:
         """Pull of each spring along itself [N]: positive stretched, negative squeezed. `net.flatten` gives (E,)."""
@@ -161,7 +189,8 @@ class Springs(Force):
 
     def diagnose(self, state: State) -> tuple[Finding, ...]:
         """COINCIDENT: springs with a rest length whose ends are at one place."""
-        if self.net.n_springs == 0 or (is_concrete(self.rest_length) and not jnp.any(self.rest_length > 0)):
+        given = state.rest_length is None and is_concrete(self.rest_length)
+        if self.net.n_springs == 0 or (given and not jnp.any(self.rest_length > 0)):
             return ()
         d, _, l = self._along(state)
 
@@ -177,7 +206,9 @@ class Springs(Force):
         rule = self.stiffness
         bad = any_refused(self.rest_length, *(() if isinstance(rule, StiffnessRule) or self.allow_negative_stiffness else (rule,)))
         by_rule = rule.invalid() if isinstance(rule, StiffnessRule) else None
-        return bad if by_rule is None else bad | by_rule
+        bad = bad if by_rule is None else bad | by_rule
+        by_expansion = None if self.expansion is None else self.expansion.invalid()
+        return bad if by_expansion is None else bad | by_expansion
 
     def rounding(self, state: State) -> Array | None:
         """The largest coordinate's rounding over the smallest rest or present length. Springs without rest length pull by k d, whose
@@ -196,13 +227,32 @@ class Springs(Force):
         largest = jnp.max(jnp.stack([jnp.max(jnp.abs(a)) for a in self._seen(state)]))
         return largest * jnp.asarray(jnp.finfo(state.dtype).eps, state.dtype) / length
 
+    def natural_length(self, state: State) -> Array | EdgeField:
+        """Rest length of each spring in this state [m]: the state's own where it has one, else the given one, times the expansion."""
+        changed = state.rest_length
+        l = changed if self._is_of_this_net(changed) else cast_inexact(self.net.edge_field(self.rest_length, "rest_length"), state.dtype)
+        if self.expansion is None:
+            return l
+        return self.net.map_springs(lambda l, factor: l * factor, l, cast_inexact(self.expansion, state.dtype).factor(self.net, state))
+
+    @property
+    def _follows_position(self) -> bool:
+        return isinstance(self.stiffness, StiffnessRule) and self.stiffness.follows_position
+
+    def _is_of_this_net(self, field: EdgeField | None) -> TypeGuard[EdgeField]:
+        return field is not None and tuple(entry.shape for entry in field.families) == self.net.family_shapes
+
     def _seen(self, state: State) -> Vector:
         return state.position if self.axes is None else Vector(tuple(state.position[a] for a in self.axes))
 
     def _constants(self, state: State) -> tuple[Array | EdgeField, Array | EdgeField]:
         rule = self.stiffness
         k = rule.stiffness(self.net, state) if isinstance(rule, StiffnessRule) else self.net.edge_field(rule, "stiffness")
-        return cast_inexact((k, self.net.edge_field(self.rest_length, "rest_length")), state.dtype)
+        k, l = cast_inexact((k, self.natural_length(state)), state.dtype)
+        if self._is_of_this_net(state.alive):
+            # `where`, since zero times what is not finite is not zero.
+            k = self.net.map_springs(lambda whole, k: jnp.where(whole, k, jnp.zeros((), k.dtype)), state.alive, k)
+        return k, l
 
     def _along(self, state: State) -> tuple[EdgeField, Array | EdgeField, Array | EdgeField]:
         k, l = self._constants(state)

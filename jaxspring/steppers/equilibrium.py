@@ -113,7 +113,7 @@ class _Scene(eqx.Module):
     def at(self, u: Vector) -> State:
         """The state displaced by `u` [m] where free, at rest."""
         moved = self.start.position + self.system.hold(u)
-        return State(self.start.time, moved, Vector.zeros_like(moved), self.start.layout)
+        return self.start.moved(moved, Vector.zeros_like(moved))
 
     def force(self, u: Vector) -> Vector:
         """Net force where free, zero where held [N]."""
@@ -279,7 +279,7 @@ def _find(search: _Search, system: System, state: State) -> Equilibrium:
     start = ready.constrain(state)
     # Free nodes end at the same place wherever they start; only held ones carry a derivative.
     anchor = ready.matrix(Blocks(), start).pick(stopped(start.position), start.position)
-    scene = _Scene(ready, State(start.time, anchor, Vector.zeros_like(anchor), start.layout))
+    scene = _Scene(ready, start.moved(anchor, Vector.zeros_like(anchor)))
     still = stopped(scene)
     end = search.run(still)
     status = _status(still, end)

@@ -21,7 +21,6 @@ Source: slide "Mass-Spring Forces" for the update of x and v; limits from the ch
 
 from __future__ import annotations
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -37,7 +36,7 @@ class ForwardEuler(Stepper):
     def step(self, system: System, state: State, dt: Array, memory: None) -> tuple[State, None]:
         """X + dt v, v + dt a."""
         a = system.acceleration(state)
-        return _moved(state, state.position + dt * state.velocity, state.velocity + dt * a), None
+        return state.moved(state.position + dt * state.velocity, state.velocity + dt * a), None
 
     def limit(self, squared_frequency: Array, damping: Array, damping_floor: Array) -> Array:
         """c_min / w^2, and 2 / c."""
@@ -50,7 +49,7 @@ class SymplecticEuler(Stepper):
     def step(self, system: System, state: State, dt: Array, memory: None) -> tuple[State, None]:
         """V + dt a, then x + dt of the new v."""
         v = state.velocity + dt * system.acceleration(state)
-        return _moved(state, state.position + dt * v, v), None
+        return state.moved(state.position + dt * v, v), None
 
     def limit(self, squared_frequency: Array, damping: Array, damping_floor: Array) -> Array:
         """4 / (c + sqrt(c^2 + 4 w^2))."""
@@ -68,9 +67,9 @@ class VelocityVerlet(Stepper):
         """Drift with the old acceleration, kick with the mean of old and new."""
         a = memory
         x = state.position + dt * (state.velocity + (0.5 * dt) * a)
-        predicted = eqx.tree_at(lambda s: s.time, _moved(state, x, state.velocity + dt * a), state.time + dt)
+        predicted = state.moved(x, state.velocity + dt * a, state.time + dt)
         a_new = system.acceleration(predicted)
-        return _moved(state, x, state.velocity + (0.5 * dt) * (a + a_new)), a_new
+        return state.moved(x, state.velocity + (0.5 * dt) * (a + a_new)), a_new
 
     def limit(self, squared_frequency: Array, damping: Array, damping_floor: Array) -> Array:
         """2 / (c + sqrt(c^2 + w^2))."""
@@ -87,8 +86,8 @@ class RungeKutta4(Stepper):
             if dx is None or dv is None:
                 stage = state
             else:
-                stage = _moved(state, state.position + (fraction * dt) * dx, state.velocity + (fraction * dt) * dv)
-                stage = eqx.tree_at(lambda s: s.time, stage, state.time + fraction * dt)
+                at = state.time + fraction * dt
+                stage = state.moved(state.position + (fraction * dt) * dx, state.velocity + (fraction * dt) * dv, at)
             return stage.velocity, system.acceleration(stage)
 
         x1, v1 = slope(0.0, None, None)
@@ -98,17 +97,13 @@ class RungeKutta4(Stepper):
         sixth = dt / 6
         x = state.position + sixth * (x1 + 2 * (x2 + x3) + x4)
         v = state.velocity + sixth * (v1 + 2 * (v2 + v3) + v4)
-        return _moved(state, x, v), None
+        return state.moved(x, v), None
 
     def limit(self, squared_frequency: Array, damping: Array, damping_floor: Array) -> Array:
         """2.61 / max(w, c); sqrt(8) / w without damping."""
         frequency = jnp.sqrt(squared_frequency)
         radius = jnp.where(damping > 0, jnp.full_like(damping, 2.61), jnp.full_like(damping, 8**0.5))
         return _ratio(radius, jnp.maximum(frequency, damping))
-
-
-def _moved(state: State, position: Vector, velocity: Vector) -> State:
-    return State(state.time, position, velocity, state.layout)
 
 
 def _ratio(a: Array, b: Array) -> Array:

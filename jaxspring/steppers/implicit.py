@@ -143,8 +143,10 @@ class ImplicitStepper(Stepper):
             problem = NewtonStage(self.adjoint, None, self.solver, self.newton)
         y, info, carried = problem.solve(stage, memory.solver)
         new = self.finish(state, dt, stage, y)
+        # A rule changes the energy between steps: what it left is where this step began.
+        before = _closed_energy(system, state) if system.rules else memory.energy
         energy = _closed_energy(system, new)
-        status = _breakdown(stage, new).then(info.status).then(self._energy_status(memory.energy, energy, stage, new))
+        status = _breakdown(stage, new).then(info.status).then(self._energy_status(before, energy, stage, new))
         return new, Memory(carried, SolveInfo(info.residual, info.iterations, status), self.remember(state), energy)
 
     def report(self, memory: Memory) -> SolveInfo:
@@ -203,7 +205,7 @@ class ImplicitMidpoint(ImplicitStepper):
     def finish(self, state: State, dt: Array, stage: Stage, y: Vector) -> State:
         """X + dt v*, 2 v* - v."""
         middle = stage.full(y)
-        return State(state.time + dt, state.position + dt * middle, stage.system.hold(2 * middle - state.velocity), state.layout)
+        return state.moved(state.position + dt * middle, stage.system.hold(2 * middle - state.velocity), state.time + dt)
 
     def energy_slack(self, dtype: Any) -> float:
         """Half of the energy exchanged: the rule keeps a nearby energy, about which the true one swings."""
@@ -264,7 +266,7 @@ def _breakdown(stage: Stage, after: State) -> Status:
 
 
 def _stage(system: System, state: State, origin: Vector, velocity: Vector, h: Array, time: Array) -> Stage:
-    predictor = State(time, state.position, state.velocity, state.layout)
+    predictor = state.moved(state.position, state.velocity, time)
     return Stage(system, origin, velocity, h, time, predictor, known_velocity(system, origin, h, time), origin is state.position)
 
 

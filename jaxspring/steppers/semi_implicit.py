@@ -150,7 +150,7 @@ class _Solve(ImplicitProblem):
 
 def _moved(state: State, dt: Array, dv: Vector) -> State:
     v = state.velocity + dv
-    return State(state.time, state.position + dt * v, v, state.layout)
+    return state.moved(state.position + dt * v, v)
 
 
 __all__ = ["SemiImplicit"]

@@ -9,6 +9,7 @@ limit is that much larger than what `stable_dt` returns.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable
 from typing import Any
 
@@ -47,7 +48,9 @@ def stable_dt(system: System, state: State, stepper: Stepper | None = None) -> A
 
 def dt_limit(system: System, state: State, stepper: Stepper) -> Array | None:
     """As `stable_dt`, for a prepared system; None for a stepper that does not know its limit."""
-    return stepper.limit(*_bounds(system, state, stepper))
+    limits = [stepper.limit(*_bounds(system, state, stepper)), *(rule.limit(state) for rule in system.rules or ())]
+    known = [limit for limit in limits if limit is not None]
+    return functools.reduce(jnp.minimum, known) if known else None
 
 
 def _bounds(system: System, state: State, stepper: Stepper) -> tuple[Array, Array, Array]:

@@ -62,7 +62,7 @@ class Stage(eqx.Module):
     def reached(self, y: Vector) -> State:
         """The state that the velocity `y` leads to."""
         v = self.full(y)
-        return State(self.time, self.origin + self.h * v, v, self.predictor.layout)
+        return self.predictor.moved(self.origin + self.h * v, v, self.time)
 
     def inertia(self, y: Vector) -> Vector:
         """M (y - v0) / h [N]."""

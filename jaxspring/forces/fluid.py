@@ -1,0 +1,221 @@
+"""A fluid of particles: every pair attracts at long range and repels at short range.
+
+    g_i = sum over j of q_i q_j w(r_ij) (x_i - x_j)  -  drag of the pair           [N]      w: see `pair_laws`
+
+Momentum and angular momentum are kept to rounding: each pair's force acts along its line, and its two ends are computed alike.
+While nothing is fluid no pair is evaluated: the sum stands in a conditional, which stays one under `vmap` (`numerics.any_lane`).
+
+Source: slide "Discrete Fluid Model".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from .._checks import is_concrete
+from ..numerics import any_lane, stopped
+from ..state import State
+from ..status import Flag, Status
+from ..topology.base import Topology
+from ..vector import Vector
+from .base import Finding, Force
+from .cutoffs import Cutoff, NoCutoff
+from .molten import Molten
+from .pair_drag import PairDrag
+from .pair_laws import PairLaw, _constant
+from .pair_terms import Fields, PairTerms, Particles
+from .pairs import AllPairs, Pairs
+
+# The core unless the user names one, in equilibrium distances: far inside any distance that a resolved run reaches.
+CORE_FRACTION = 0.01
+
+
+class Fluid(Force):
+    """A particle fluid on all nodes, or on those that have melted.
+
+    Attributes:
+        law: `SlideLaw`, `UnitVectorLaw`, `LennardJones` or your own.
+        cutoff: `NoCutoff()` unless said; or `PlainCutoff`, `ShiftedForce`, `Switched`.
+        pairs: `AllPairs()` unless said, or `NeighbourList` where the law has a cut-off.
+        drag: `PairDrag`, or None.
+        core: distance [m] below which the force per unit of difference stops growing; such pairs are counted as OVERLAP. A hundredth of the
+            equilibrium distance unless said.
+        molten: `Molten(net)`: only particles without a living spring are fluid; None: all are.
+        mass: [kg]; `System` fills it in.
+
+    Raises:
+        ValueError: a list without a cut-off, a core or a drag that does not fit inside it.
+
+    >>> net = js.Graph.from_edges(np.zeros((0, 2), int), 2)
+    >>> system = js.System(net, mass=1.0, forces=Fluid(js.SlideLaw(alpha=1.0, beta=1.0)))
+    >>> apart = js.State.from_points(net, [[0.0, 0.0], [2.0, 0.0]])
+    >>> print(system.force(apart).x)
+    [ 0.375 -0.375]
+    """
+
+    law: PairLaw
+    cutoff: Cutoff
+    pairs: Pairs
+    drag: PairDrag | None
+    core: Array
+    molten: Molten | None
+    mass: Array | None
+
+    def __init__(
+        self,
+        law: PairLaw,
+        cutoff: Cutoff | None = None,
+        pairs: Pairs | None = None,
+        drag: PairDrag | None = None,
+        core: Any = None,
+        molten: Molten | None = None,
+    ):
+        self.law = law
+        self.cutoff = NoCutoff() if cutoff is None else cutoff
+        self.pairs = AllPairs() if pairs is None else pairs
+        self.drag = drag
+        self.core = CORE_FRACTION * law.equilibrium_distance if core is None else _constant("core", core)
+        self.molten = molten
+        self.mass = None
+        self._check()
+
+    @property
+    def net(self) -> Topology | None:
+        """The topology that tells what is molten, or None."""
+        return None if self.molten is None else self.molten.net
+
+    @property
+    def is_rule(self) -> bool:
+        """Yes: it looks at dt after each step, and keeps its list."""
+        return True
+
+    def with_mass(self, mass: Array) -> Fluid:
+        """The same fluid of these masses [kg]."""
+        return eqx.tree_at(lambda f: f.mass, self, mass, is_leaf=lambda leaf: leaf is None)
+
+    def with_forces(self, forces: tuple[Force, ...]) -> Fluid:
+        """The same; refuses a second list, for which a state has no place.
+
+        Raises:
+            ValueError: two fluids with neighbour lists in one system.
+        """
+        if self.pairs.needs_reach and sum(isinstance(f, Fluid) and f.pairs.needs_reach for f in forces) > 1:
+            raise ValueError("two fluids of this system have a NeighbourList, but a state keeps one list. Give one of them AllPairs().")
+        return self
+
+    def force(self, state: State) -> Vector:
+        """Force on each node [N]."""
+        return Vector(self._sum(state, lambda terms: terms.force, state.dim, self.drag is not None))
+
+    def energy(self, state: State) -> Array:
+        """Sum of the pairs' potentials [J]; below zero, without bound for many particles, where the law attracts at every distance."""
+        return jnp.sum(self._sum(state, lambda terms: terms.energy, 1)[0])
+
+    def can_feed(self, state: State) -> bool:
+        """No: the pairs have a potential, and drag takes energy out."""
+        return False
+
+    def is_symmetric(self, state: State) -> bool:
+        """Central forces are; drag that depends on the distance is not."""
+        return self.drag is None
+
+    def stiffness_bound(self, state: State) -> Array:
+        """Twice the sum of the pairs' stiffnesses at each node [N/m], where they are now: pairs that come closer are stiffer."""
+        return self._sum(state, lambda terms: terms.stiffness, 1)[0]
+
+    def damping_bound(self, state: State) -> Array | None:
+        """Twice the sum of the pairs' drag coefficients at each node [N s/m]; None without drag."""
+        return None if self.drag is None else self._sum(state, lambda terms: terms.damping, 1)[0]
+
+    def diagnose(self, state: State) -> tuple[Finding, ...]:
+        """OVERLAP: pairs closer than the core, with the first node of one; NEIGHBOUR_OVERFLOW with the capacity that is needed."""
+        count = self._sum(state, lambda terms: terms.overlap, 1)[0]
+        pairs = jnp.round(jnp.sum(count) / 2).astype(jnp.int32)
+        findings = (Finding(Flag.OVERLAP, pairs, jnp.argmax(jnp.ravel(count) > 0).astype(jnp.int32)),)
+        needed = self.pairs.needed(state.neighbours)
+        nowhere = jnp.asarray(-1, jnp.int32)
+        return findings if needed is None else (Finding(Flag.NEIGHBOUR_OVERFLOW, needed, nowhere), *findings)
+
+    def begin(self, state: State) -> State:
+        """The state with the list that its pairs reuse, where it has none."""
+        if state.neighbours is not None:
+            return state
+        return replace(state, neighbours=self.pairs.begin(stopped(self._flat(state)), self.cutoff.reach))
+
+    def update(self, before: State, state: State, dt: Array) -> tuple[State, Status]:
+        """The list brought up to date, and DT_LIMIT where dt is too long for two of the fastest particles that meet head-on."""
+        before, still, dt = stopped((before, state, dt))
+        memory, status = self.pairs.update(still.neighbours, self._flat(before), self._flat(still), self.cutoff.reach)
+        limit, node = self.collision_dt(still)
+        too_long = Status.when(Flag.DT_LIMIT, jnp.abs(dt) > limit, node=node)
+        return replace(state, neighbours=memory), status.then(too_long)
+
+    def collision_dt(self, state: State) -> tuple[Array, Array]:
+        """Largest dt [s] at which every particle could meet one as fast head-on, and the flat index of the particle that sets it.
+
+        Two particles of mass m and speed v turn where the repulsion has taken up m v**2; the pair's frequency there must stay below 2 / dt.
+        """
+        mass = self._mass(state)
+        speed = state.velocity.dot(state.velocity)
+        charge = mass * mass if self.law.uses_mass else jnp.ones_like(mass)
+        squared = 2 * charge * self.law.turning_stiffness(mass * speed / charge, self.core) / mass
+        if self.molten is not None:
+            squared = jnp.where(self.molten.is_fluid(state), squared, jnp.zeros((), squared.dtype))
+        node = jnp.argmax(jnp.ravel(squared)).astype(jnp.int32)
+        return 2 * lax.rsqrt(jnp.max(squared)), node
+
+    def _check(self) -> None:
+        reach = self.cutoff.reach
+        if reach is None:
+            if self.pairs.needs_reach:
+                raise ValueError(
+                    "a neighbour list needs a law that ends. Pass cutoff=PlainCutoff(r), ShiftedForce(r) or Switched(on, off)."
+                )
+            return
+        inner = {"core": self.core, "the equilibrium distance": self.law.equilibrium_distance}
+        if self.drag is not None and self.pairs.needs_reach:
+            inner["drag.radius"] = self.drag.radius
+        for name, value in inner.items():
+            if is_concrete(value) and is_concrete(reach) and bool(value > reach.astype(value.dtype)):
+                raise ValueError(f"{name} = {value} m is beyond the cut-off, {reach} m. Unchecked, pairs between the two would be dropped.")
+
+    def _sum(self, state: State, term: Callable[[PairTerms], Any], n: int, with_velocity: bool = False) -> Fields:
+        """Sum of a pair term at each node, `n` arrays in node shape; zeros while nothing is fluid."""
+        shape = state.position.shape
+        fluid = None if self.molten is None else self.molten.is_fluid(state)
+        particles = Particles(
+            position=self._flat(state),
+            charge=jnp.ravel(self._mass(state)) if self.law.uses_mass else None,
+            fluid=None if fluid is None else jnp.ravel(fluid).astype(state.dtype),
+            velocity=tuple(jnp.ravel(a) for a in state.velocity) if with_velocity else (),
+        )
+        memory = state.neighbours
+        if memory is None:
+            memory = self.pairs.begin(stopped(particles.position), self.cutoff.reach)
+
+        def summed(operands: tuple[Particles, PairTerms, Any]) -> Fields:
+            particles, terms, memory = operands
+            return self.pairs.sum(term(terms), particles.fields(), memory)
+
+        def nothing(operands: tuple[Particles, PairTerms, Any]) -> Fields:
+            return (jnp.zeros(particles.position[0].shape, state.dtype),) * n
+
+        terms = PairTerms(self.law, self.cutoff, self.core, self.drag, particles)
+        operands = (particles, terms, memory)
+        flat = summed(operands) if fluid is None else lax.cond(any_lane(jnp.any(fluid)), summed, nothing, operands)
+        return tuple(a.reshape(shape) for a in flat)
+
+    def _flat(self, state: State) -> Fields:
+        return tuple(jnp.ravel(a) for a in state.position)
+
+    def _mass(self, state: State) -> Array:
+        if self.mass is None:
+            raise ValueError("Fluid has no masses yet. Put it in a System and ask that, or the forces of system.prepare(state.dtype).")
+        return jnp.broadcast_to(self.mass.astype(state.dtype), state.position.shape)

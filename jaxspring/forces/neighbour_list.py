@@ -1,0 +1,135 @@
+"""Neighbour lists: the pairs within the cut-off and a skin, found now and then, and reused in between.
+
+    listed      pairs nearer than reach + skin
+    rebuilt     when a particle may, after one more step like the last, have moved skin / 2 since the list was made
+
+So no pair comes within reach unlisted. The list is made inside `jit`, under a conditional on the device. Derivatives pass through the
+positions, not through the list: a pair that enters or leaves it has no force there.
+
+A list too small for its pairs is never cut: NEIGHBOUR_OVERFLOW tells the capacity that is needed, and until then the sums run over all
+pairs, right but slow.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from ..numerics import any_lane
+from ..status import Flag, Status
+from .cells import Neighbourhood, find_neighbours
+from .pair_laws import _constant
+from .pairs import AllPairs, PairFunction, Pairs
+
+Fields = tuple[Array, ...]
+
+# Neighbours taken at a time: fewer write the sums more often, more compile longer.
+SLOTS = 8
+
+
+class NeighbourMemory(eqx.Module):
+    """A list and the positions for which it was made.
+
+    Attributes:
+        near: who is near whom.
+        reference: D arrays (N,) of positions [m] when it was made.
+        rebuilds: how often it was made anew.
+    """
+
+    near: Neighbourhood
+    reference: Fields
+    rebuilds: Array
+
+
+class NeighbourList(Pairs):
+    """Pairs within the law's cut-off, from a list of fixed capacity.
+
+    Attributes:
+        capacity: neighbours of a particle within reach + skin for which there is room (static). Take a quarter more than the densest place
+            has; NEIGHBOUR_OVERFLOW tells what is needed.
+        skin: [m] by which the list reaches beyond the cut-off. A wider one is remade less often and holds more pairs.
+    """
+
+    capacity: int = eqx.field(static=True)
+    skin: Array
+
+    def __init__(self, capacity: int, skin: Any):
+        if not isinstance(capacity, int) or isinstance(capacity, bool) or capacity < 1:
+            raise ValueError(f"capacity = {capacity!r}; expected a whole number of neighbours, 1 or more.")
+        self.capacity = -(-capacity // SLOTS) * SLOTS
+        self.skin = _constant("skin", skin)
+
+    @property
+    def needs_reach(self) -> bool:
+        """Yes."""
+        return True
+
+    def begin(self, position: Fields, reach: Array | None) -> NeighbourMemory:
+        """A list for these positions."""
+        return NeighbourMemory(self._find(position, reach), position, jnp.zeros((), jnp.int32))
+
+    def update(self, memory: NeighbourMemory, before: Fields, position: Fields, reach: Array | None) -> tuple[NeighbourMemory, Status]:
+        """The list as it is, or made anew where a particle has moved far; DT_LIMIT where one step went farther than half the skin."""
+        step, moved = _farthest(before, position), _farthest(memory.reference, position)
+        is_stale = any_lane(step + moved > self.skin / 2)
+
+        def anew(memory: NeighbourMemory) -> NeighbourMemory:
+            return NeighbourMemory(self._find(position, reach), position, memory.rebuilds + 1)
+
+        fresh = lax.cond(is_stale, anew, lambda memory: memory, memory)
+        needed = fresh.near.needed
+        status = Status.when(Flag.NEIGHBOUR_OVERFLOW, needed > self.capacity, count=needed)
+        return fresh, status.then(Status.when(Flag.DT_LIMIT, step > self.skin / 2))
+
+    def needed(self, memory: NeighbourMemory) -> Array:
+        """Capacity needed where the list is too small, else 0."""
+        return jnp.where(memory.near.needed > self.capacity, memory.near.needed, 0)
+
+    def sum(self, function: PairFunction, fields: Fields, memory: NeighbourMemory) -> Fields:
+        """Sum over the listed pairs; over all pairs where the list is too small."""
+        return lax.cond(
+            any_lane(memory.near.needed > self.capacity),
+            lambda fields, near: AllPairs().sum(function, fields),
+            lambda fields, near: _sum_listed(function, fields, near),
+            fields,
+            memory.near,
+        )
+
+    def _find(self, position: Fields, reach: Array | None) -> Neighbourhood:
+        if reach is None:
+            raise ValueError("a neighbour list needs a law with a cut-off.")
+        dtype = position[0].dtype
+        return find_neighbours(position, reach.astype(dtype) + self.skin.astype(dtype), self.capacity)
+
+
+def _sum_listed(function: PairFunction, fields: Fields, near: Neighbourhood) -> Fields:
+    """Sum over the table's rows, all particles at a time, in the order of their cells, so that neighbours are near in memory."""
+    own = tuple(a[near.order] for a in fields)
+    n = own[0].shape[0]
+    numbers = jnp.arange(n, dtype=jnp.int32)
+
+    def of_row(row: Array) -> Fields:
+        return function(own, tuple(a.at[row].get(mode="promise_in_bounds") for a in own), row != numbers)
+
+    # Rematerialised, so that a gradient keeps no pair.
+    @jax.checkpoint
+    def add_rows(total: Fields, rows: Array) -> tuple[Fields, None]:
+        for i in range(SLOTS):
+            total = tuple(t + value for t, value in zip(total, of_row(rows[i]), strict=True))
+        return total, None
+
+    shapes = jax.eval_shape(of_row, numbers)
+    start = tuple(jnp.zeros(s.shape, s.dtype) for s in shapes)
+    total, _ = lax.scan(add_rows, start, near.table.reshape(-1, SLOTS, n))
+    return tuple(a[near.place] for a in total)
+
+
+def _farthest(a: Fields, b: Fields) -> Array:
+    """Largest distance between two sets of positions [m]."""
+    squared = sum(((p - q) * (p - q) for p, q in zip(a, b, strict=True)), start=jnp.zeros_like(a[0]))
+    return jnp.sqrt(jnp.max(squared, initial=0))

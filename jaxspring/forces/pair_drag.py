@@ -1,0 +1,42 @@
+"""Drag between particles: what they lose of their approach, momentum and angular momentum stay.
+
+    f_i = -c(r) ((v_i - v_j) . u) u        c(r) = eta (1 - r/R)**2 below R, 0 beyond        [N]
+
+u is the unit vector between the two. The force acts along the line of the pair and is opposite for the other end.
+
+Source: the dissipative force of dissipative particle dynamics; the slides' fluid has no dissipation of its own.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._checks import as_inexact, has_shape, nonnegative
+from .pair_laws import _constant
+
+
+class PairDrag(eqx.Module):
+    """Drag along the line of each pair that is near.
+
+    Attributes:
+        damping: eta [N s/m].
+        radius: R [m]; beyond it there is no drag.
+    """
+
+    damping: Array
+    radius: Array
+
+    def __init__(self, damping: Any, radius: Any):
+        self.damping = as_inexact("damping", damping)
+        has_shape("damping", self.damping, {"one number": ()})
+        nonnegative("damping", self.damping, "A negative drag feeds energy in.")
+        self.radius = _constant("radius", radius)
+
+    def rate(self, squared: Array) -> Array:
+        """C(r) [N s/m] of a squared distance [m^2]."""
+        near = jnp.maximum(1 - jnp.sqrt(squared) / self.radius, jnp.zeros((), squared.dtype))
+        return self.damping * near * near

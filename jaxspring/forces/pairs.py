@@ -1,0 +1,91 @@
+"""Sums over pairs of particles: for every particle i, the sum over all j of g(i, j).
+
+`g` is evaluated twice per pair, once for each end, so that nothing is scattered: the result is the same bit for bit in every run, and the
+two halves of an antisymmetric `g` cancel exactly.
+"""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ..status import Status
+
+# (own fields, other's fields, whether the two are two) -> values, all arrays that broadcast against each other.
+PairFunction = Callable[[tuple[Array, ...], tuple[Array, ...], Array], tuple[Array, ...]]
+
+# Measured on a CPU: fewer rows vectorise less, more leave the cache.
+ROWS_AT_A_TIME = 128
+
+
+class Pairs(eqx.Module):
+    """Which pairs are looked at. Abstract."""
+
+    @abc.abstractmethod
+    def sum(self, function: PairFunction, fields: tuple[Array, ...], memory: Any) -> tuple[Array, ...]:
+        """For each particle the sum of `function` over the others: arrays (N,) from fields of shape (N,).
+
+        A place that holds no pair is passed with own = other; `function` must be zero there, or use its last argument.
+        """
+
+    @property
+    def needs_reach(self) -> bool:
+        """Whether the law must have a cut-off."""
+        return False
+
+    def begin(self, position: tuple[Array, ...], reach: Array | None) -> Any:
+        """What is remembered between steps, made from the positions; None where nothing is."""
+        return None
+
+    def update(self, memory: Any, before: tuple[Array, ...], position: tuple[Array, ...], reach: Array | None) -> tuple[Any, Status]:
+        """The memory after a step from `before` to `position`."""
+        return memory, Status.ok()
+
+    def needed(self, memory: Any) -> Array | None:
+        """Capacity that the memory would need where it is too small, else 0; None where nothing is remembered."""
+        return None
+
+
+class AllPairs(Pairs):
+    """Every pair, in tiles of rows, so that memory stays bounded: N**2 evaluations.
+
+    Attributes:
+        tile: rows at a time (static); None takes 128.
+    """
+
+    tile: int | None = eqx.field(static=True)
+
+    def __init__(self, tile: int | None = None):
+        if tile is not None and (not isinstance(tile, int) or isinstance(tile, bool) or tile < 1):
+            raise ValueError(f"tile = {tile!r}; expected a whole number of rows, 1 or more, or None.")
+        self.tile = tile
+
+    def sum(self, function: PairFunction, fields: tuple[Array, ...], memory: Any = None) -> tuple[Array, ...]:
+        """Sum over all others, a tile of rows at a time."""
+        n = fields[0].shape[0]
+        tile = max(1, min(n, ROWS_AT_A_TIME if self.tile is None else self.tile))
+        n_tiles = -(-n // tile)
+        everyone = tuple(a[:, None] for a in fields)
+        numbers = jnp.arange(n, dtype=jnp.int32)
+
+        # The sum runs down the columns, whose accumulators are the rows of the tile: that loop vectorises.
+        def of_tile(rows: tuple[Array, tuple[Array, ...]]) -> tuple[Array, ...]:
+            own_numbers, own = rows
+            values = function(tuple(a[None, :] for a in own), everyone, own_numbers[None, :] != numbers[:, None])
+            return tuple(jnp.sum(value, axis=0) for value in values)
+
+        if n_tiles == 1:
+            return of_tile((numbers, fields))
+
+        def tiled(a: Array) -> Array:
+            return jnp.pad(a, (0, n_tiles * tile - n)).reshape(n_tiles, tile)
+
+        # Rematerialised, so that a gradient keeps no tile either.
+        sums = jax.lax.map(jax.checkpoint(of_tile), jax.tree.map(tiled, (numbers, fields)))
+        return tuple(a.reshape(n_tiles * tile)[:n] for a in sums)

@@ -1,0 +1,23 @@
+"""Nodes that do not move: for scenes of heat alone."""
+
+from __future__ import annotations
+
+from jaxtyping import Array
+
+from ..state import State
+from ..system import System
+from .base import Stepper
+
+
+class Still(Stepper):
+    """Leaves every node where it is and as fast as it is; time passes, and rules act.
+
+    Forces are not evaluated. Nodes on a schedule still follow it.
+    """
+
+    def step(self, system: System, state: State, dt: Array, memory: None) -> tuple[State, None]:
+        """The same state."""
+        return state, None
+
+
+__all__ = ["Still"]

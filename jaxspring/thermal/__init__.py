@@ -1,0 +1,1 @@
+"""Heat and melting: conduction, boundary conditions, latent heat, softening springs."""

@@ -1,0 +1,138 @@
+"""Springs that fuse: above the melting point a spring breaks, and its bit in `state.alive` is cleared.
+
+    breaks      theta_ij >= theta_m                                theta_ij = (theta_i + theta_j) / 2       [K]
+    comes back  never, unless `Refreezing` is named: then where theta_ij <= theta_m - hysteresis and the ends are within reach,
+                with its present length as rest length, so that it comes back without a pull and without energy
+
+Velocities and positions are untouched, so momentum is continuous; shapes never change. Breaking is a decision: it has no gradient.
+
+Source: Terzopoulos, Platt and Fleischer (1989): a thermoelastic unit fuses above the melting point. Refreezing is this library's.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._checks import as_inexact, finite, has_shape, nonnegative, positive
+from ..forces.base import Force, Rule
+from ..forces.molten import Molten
+from ..forces.springs import Springs
+from ..numerics import cast_inexact
+from ..state import State
+from ..status import Flag, Status
+from ..topology.base import Topology
+from ..topology.edge_field import EdgeField
+from .stiffness import temperature_of
+
+
+class Refreezing(eqx.Module):
+    """Springs that come back once cold.
+
+    Attributes:
+        hysteresis: how far below the melting point a spring comes back [K]; noise of less than that toggles nothing.
+        reach: longest spring that can come back [m].
+    """
+
+    hysteresis: Array
+    reach: Array
+
+    def __init__(self, hysteresis: Any, reach: Any):
+        self.hysteresis, self.reach = as_inexact("hysteresis", hysteresis), as_inexact("reach", reach)
+        for name, value in (("hysteresis", self.hysteresis), ("reach", self.reach)):
+            has_shape(name, value, {"one number": ()})
+        nonnegative("hysteresis", self.hysteresis, "A spring would come back while it is hot.")
+        positive("reach", self.reach, "No spring could come back. Leave refreezing out.")
+
+
+class Fusing(Rule):
+    """Springs break at the melting point. Belongs to a system's `rules`, after `Heat`.
+
+    Attributes:
+        net: the system's net.
+        melting: theta_m [K].
+        refreezing: `Refreezing`, or None: what is broken stays so.
+        springs: those whose rest lengths change when they come back; the system fills it in.
+
+    Raises:
+        ValueError: a melting point that is not finite; at the start of a run a state without temperature, or refreezing without springs
+            of this net.
+
+    >>> import jaxspring as js
+    >>> net = js.lattice(3)
+    >>> system = js.System(net, 1.0, js.Springs(net, 1.0, 1.0), rules=Fusing(net, melting=350.0))
+    >>> start = js.State.from_points(net, net.grid(), temperature=[300.0, 340.0, 400.0])
+    >>> print(net.flatten(js.rollout(system, start, js.Still(), dt=0.1, n_steps=1).state.alive))
+    [ True False]
+    """
+
+    net: Topology
+    melting: Array
+    refreezing: Refreezing | None
+    springs: Springs | None
+
+    def __init__(self, net: Topology, melting: Any, refreezing: Refreezing | None = None):
+        self.net = net
+        self.melting = as_inexact("melting", melting)
+        has_shape("melting", self.melting, {"one number": ()})
+        finite("melting", self.melting)
+        if refreezing is not None and not isinstance(refreezing, Refreezing):
+            raise TypeError(f"refreezing is a {type(refreezing).__name__}; expected Refreezing(hysteresis, reach), or None.")
+        self.refreezing = refreezing
+        self.springs = None
+
+    def with_forces(self, forces: tuple[Force, ...]) -> Fusing:
+        """The same, knowing the springs that may come back."""
+        if self.refreezing is None:
+            return self
+        own = [f for f in forces if isinstance(f, Springs) and f.net.family_shapes == self.net.family_shapes]
+        if len(own) != 1:
+            raise ValueError(f"refreezing needs one Springs on the net of Fusing, whose rest lengths change; this system has {len(own)}.")
+        return eqx.tree_at(lambda r: r.springs, self, own[0], is_leaf=lambda leaf: leaf is None)
+
+    def begin(self, state: State) -> State:
+        """The state with a bit for every spring and, where springs come back, a rest length of every spring."""
+        temperature_of(state, "Fusing")
+        if state.alive is None:
+            whole = EdgeField(tuple(jnp.ones(shape, bool) for shape in self.net.family_shapes))
+            state = dataclasses.replace(state, alive=whole)
+        elif tuple(entry.shape for entry in state.alive.families) != self.net.family_shapes:
+            raise ValueError("state.alive is of another net than Fusing. Build both on the system's net.")
+        if self.refreezing is not None and self.springs is not None and state.rest_length is None:
+            given = cast_inexact(self.springs.net.edge_field(self.springs.rest_length, "rest_length"), state.dtype)
+            lengths = given.families if isinstance(given, EdgeField) else (given,) * len(self.net.family_shapes)
+            full = tuple(jnp.broadcast_to(l, shape) for l, shape in zip(lengths, self.net.family_shapes, strict=True))
+            state = dataclasses.replace(state, rest_length=EdgeField(full))
+        return state
+
+    def update(self, before: State, state: State, dt: Array) -> tuple[State, Status]:
+        """Springs broken where hot, and back where cold and near."""
+        melting = self.melting.astype(state.dtype)
+        warm = self.net.average(temperature_of(state, "Fusing"))
+        alive = self.net.map_springs(lambda whole, theta: whole & (theta < melting), state.alive, warm)
+        refused = Status.when(Flag.INVALID, ~jnp.isfinite(melting))
+        if self.refreezing is None:
+            return dataclasses.replace(state, alive=alive), refused
+        cold, reach = melting - self.refreezing.hysteresis.astype(state.dtype), self.refreezing.reach.astype(state.dtype)
+        length = self.net.difference(state.position).map(lambda d: d.norm())
+        back = self.net.map_springs(
+            lambda whole, theta, l: ~whole & (theta <= cold) & (theta < melting) & (l <= reach), alive, warm, length
+        )
+        natural = length
+        if self.springs is not None and self.springs.expansion is not None:
+            factor = self.springs.expansion.factor(self.net, state)
+            natural = self.net.map_springs(lambda l, f: l / jnp.where(f > 0, f, jnp.ones_like(f)), length, factor)
+        rest = self.net.map_springs(jnp.where, back, natural, state.rest_length)
+        return dataclasses.replace(state, alive=self.net.map_springs(jnp.logical_or, alive, back), rest_length=rest), refused
+
+
+def melted_fraction(net: Topology, state: State) -> Array:
+    """Share of the particles that no living spring holds (leading axes of saved states are not accepted: use `jax.vmap`)."""
+    return jnp.mean(Molten(net).is_fluid(state).astype(state.dtype))
+
+
+__all__ = ["Fusing", "Refreezing", "melted_fraction"]

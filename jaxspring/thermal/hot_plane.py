@@ -1,0 +1,112 @@
+"""A hot surface that heats what touches it: Newton's term on every node within reach of a plane.
+
+    s_i = (x_i - p) . n                                          [m]   height over the plane; below it, s < 0, counts as touching
+    P_i = w(s_i) h A_i (theta_plane - theta_i)                   [W]   w = 1 for s <= reach, falling linearly to 0 at reach + fade
+
+The reaction force of the surface is another effect, named apart.
+
+Source: the hot constraint surfaces of Terzopoulos, Platt and Fleischer (1989); the law of the contact is Newton's.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._checks import as_inexact, finite, is_concrete, nonnegative
+from ..forces.base import any_refused
+from ..state import State
+from .boundaries import Given, ThermalBoundary, at_time
+
+
+class HotPlane(ThermalBoundary):
+    """A plane that heats (or cools) the nodes within its reach.
+
+    Attributes:
+        point: (D,) a point of the plane [m].
+        normal: (D,) its normal, away from the wall; of length one.
+        temperature: [K], a number, or a function of time [s] that gives one.
+        coefficient: h [W/(m^2 K)].
+        area: of contact of each node [m^2], a number or a node array in node shape.
+        reach: a node lower than this over the plane touches it [m].
+        fade: over this height beyond the reach the contact falls to nothing [m]. With 0 it ends at once: the heat then has no
+            derivative by the position.
+
+    Raises:
+        ValueError: a negative coefficient, area or fade, a normal without length, shapes that differ.
+    """
+
+    is_linear: ClassVar[bool] = True
+    point: Array
+    normal: Array
+    temperature: Given
+    coefficient: Array
+    area: Array
+    reach: Array
+    fade: Array
+
+    def __init__(self, point: Any, normal: Any, temperature: Any, coefficient: Any, area: Any, reach: Any, fade: Any = 0.0):
+        """Check what is given.
+
+        Args:
+        point: (D,) [m].
+        normal: (D,), of any length.
+        temperature: [K].
+        coefficient: [W/(m^2 K)].
+        area: [m^2].
+        reach: [m].
+        fade: [m].
+        """
+        self.point = as_inexact("point", point)
+        normal = as_inexact("normal", normal)
+        for name, value in (("point", self.point), ("normal", normal)):
+            finite(name, value)
+            if value.ndim != 1 or value.shape[0] not in (1, 2, 3) or value.shape != self.point.shape:
+                raise ValueError(f"{name} has shape {value.shape}; expected (D,), one number per coordinate, e.g. (0, 0, 1).")
+        length = jnp.sqrt(jnp.sum(normal**2))
+        if is_concrete(length) and not length > 0:
+            raise ValueError("normal has no length, so the plane no direction. Pass e.g. normal=(0, 0, 1).")
+        self.normal = normal / length
+        self.temperature = temperature if callable(temperature) else as_inexact("temperature", temperature)
+        self.coefficient = as_inexact("coefficient", coefficient)
+        self.area = as_inexact("area", area)
+        self.reach = as_inexact("reach", reach)
+        self.fade = as_inexact("fade", fade)
+        if not callable(temperature):
+            finite("temperature", temperature)
+        finite("reach", self.reach)
+        for name, value in (("coefficient", self.coefficient), ("area", self.area), ("fade", self.fade)):
+            nonnegative(name, value, "Heat would flow from cold to hot." if name != "fade" else "A length cannot be negative.")
+
+    def contact(self, state: State) -> Array:
+        """How well each node touches the plane: 1 within reach, 0 away from it."""
+        if self.point.shape[0] != state.dim:
+            raise ValueError(f"the plane has {self.point.shape[0]} coordinates, the positions have {state.dim}.")
+        beyond = -self.reach * jnp.ones_like(state.position[0])
+        for x, p, n in zip(state.position, self.point, self.normal, strict=True):
+            beyond = beyond + n * (x - p)
+        one, zero = jnp.ones_like(beyond), jnp.zeros_like(beyond)
+        fades = self.fade > 0
+        ramp = jnp.clip(1 - beyond / jnp.where(fades, self.fade, jnp.ones_like(self.fade)), 0, 1)
+        return jnp.where(fades, ramp, jnp.where(beyond <= 0, one, zero))
+
+    def power(self, state: State, temperature: Array) -> Array:
+        """W h A (theta_plane - theta) [W]."""
+        return self.slope(state, temperature) * (at_time(self.temperature, state.time, temperature) - temperature)
+
+    def slope(self, state: State, temperature: Array) -> Array:
+        """W h A [W/K]."""
+        return self.contact(state) * self.coefficient * self.area
+
+    def slope_bound(self, state: State, temperature: Array) -> Array:
+        """H A, as if all nodes touched [W/K]."""
+        return jnp.broadcast_to(self.coefficient * self.area, temperature.shape)
+
+    def invalid(self) -> Array:
+        """Whether coefficient, area or fade is negative or not finite."""
+        return any_refused(self.coefficient, self.area, self.fade)
+
+
+__all__ = ["HotPlane"]

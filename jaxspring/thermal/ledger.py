@@ -1,0 +1,231 @@
+"""The energy ledger: what changed the energy of a scene, by name, step after step.
+
+    columns   kinetic, the potential of each force, heat (with latent heat)                                [J]
+    motion    work of forces without potential, dt F . (v + v') / 2, and of the drag within others; what the columns changed besides
+              is the stepper's own error, which falls with dt
+    rules     the columns after each rule minus before: heat from outside, energy that softening, fusing and contact took
+
+With symplectic Euler, dt F . (v + v') / 2 summed over all forces is the change of kinetic energy exactly. All entries together are the
+change of the columns to rounding. Momentum is kept alike: what motion and each rule gave.
+
+Source: first law; the split of a kick is that of m (v'^2 - v^2) / 2 = dt F . (v + v') / 2.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..forces.base import Finding, Force, Rule
+from ..numerics import cast_inexact
+from ..state import State
+from ..status import Status
+from ..topology.base import Topology
+from ..vector import Vector
+from .heat import Heat, total_heat
+
+
+class Account(eqx.Module):
+    """What a `Ledger` keeps in `state.ledger`; `energy_ledger` reads it.
+
+    Attributes:
+        start: (2 + F,) columns at the start [J]: kinetic, F forces, heat.
+        now: the same now.
+        work: (F,) work of drag and of forces without potential [J].
+        motion: (2 + F,) what the columns changed by motion [J].
+        rules: (R, 2 + F) what each rule changed [J].
+        impulses: (1 + R, D) momentum given by motion and by each rule [kg m/s].
+    """
+
+    start: Array
+    now: Array
+    work: Array
+    motion: Array
+    rules: Array
+    impulses: Array
+
+
+class Ledger(Rule):
+    """Runs other rules, in their order, and books what they and the motion do to the energy. It takes their place in `System(rules=...)`.
+
+    Attributes:
+        rules: heat, fusing, contact; may be empty.
+        forces: those of the system, which fills them in.
+        mass: [kg]; the system fills it in.
+
+    Raises:
+        TypeError: something that is not a rule.
+
+    >>> import jaxspring as js
+    >>> net = js.lattice(2)
+    >>> system = js.System(net, 1.0, (js.Springs(net, 1.0, 1.0), js.Drag(0.5)), rules=Ledger())
+    >>> start = js.State.from_points(net, [[0.0], [2.0]])
+    >>> book = energy_ledger(system, js.rollout(system, start, js.SymplecticEuler(), dt=0.01, n_steps=100).state)
+    >>> print(sorted(book), abs(book["residual"]) < 1e-6, book["work"]["Drag"] < 0)
+    ['end', 'impulses', 'integration', 'residual', 'rules', 'start', 'work'] True True
+    """
+
+    rules: tuple[Rule, ...]
+    forces: tuple[Force, ...] | None
+    mass: Array | None
+
+    def __init__(self, rules: Any = ()):
+        self.rules = (rules,) if isinstance(rules, Rule) else tuple(rules)
+        for i, rule in enumerate(self.rules):
+            if not isinstance(rule, Rule) or isinstance(rule, (Force, Ledger)):
+                raise TypeError(f"rules[{i}] is a {type(rule).__name__}; expected a rule, e.g. Heat(net, ...), and no second Ledger.")
+        self.forces = None
+        self.mass = None
+
+    @property
+    def net(self) -> Topology | None:
+        """The topology of the first rule that has one."""
+        return next((r.net for r in self.rules if getattr(r, "net", None) is not None), None)
+
+    def with_mass(self, mass: Array) -> Ledger:
+        """The same, knowing the masses [kg]."""
+        rules = tuple(r.with_mass(mass) for r in self.rules)
+        return eqx.tree_at(lambda r: (r.rules, r.mass), self, (rules, mass), is_leaf=lambda leaf: leaf is None)
+
+    def with_forces(self, forces: tuple[Force, ...]) -> Ledger:
+        """The same, knowing the forces."""
+        rules = tuple(r.with_forces(forces) for r in self.rules)
+        return eqx.tree_at(lambda r: (r.rules, r.forces), self, (rules, forces), is_leaf=lambda leaf: leaf is None)
+
+    def prepare(self, dtype: Any) -> Ledger:
+        """Every rule as the loop wants it."""
+        return cast_inexact(eqx.tree_at(lambda r: r.rules, self, tuple(r.prepare(dtype) for r in self.rules)), dtype)
+
+    def limit(self, state: State) -> Array | None:
+        """The smallest limit of its rules [s]."""
+        limits = [limit for limit in (r.limit(state) for r in self.rules) if limit is not None]
+        return None if not limits else jnp.min(jnp.stack(limits))
+
+    def diagnose(self, state: State) -> tuple[Finding, ...]:
+        """What its rules have to report."""
+        return tuple(finding for r in self.rules for finding in r.diagnose(state))
+
+    def invalid(self) -> Array | None:
+        """Whether a rule holds a constant that its constructor refuses."""
+        bad = [b for b in (r.invalid() for r in self.rules) if b is not None]
+        return None if not bad else jnp.any(jnp.stack(bad))
+
+    def begin(self, state: State) -> State:
+        """The state with what its rules need, and an account."""
+        for rule in self.rules:
+            state = rule.begin(state)
+        if state.ledger is not None:
+            return state
+        now = self.columns(state)
+        n = len(self._forces())
+        work, books = jnp.zeros(n, state.dtype), jnp.zeros((len(self.rules), n + 2), state.dtype)
+        account = Account(now, now, work, jnp.zeros_like(now), books, jnp.zeros((1 + len(self.rules), state.dim), state.dtype))
+        return dataclasses.replace(state, ledger=account)
+
+    def update(self, before: State, state: State, dt: Array) -> tuple[State, Status]:
+        """Every rule, with its entry."""
+        account: Account = state.ledger
+        work = account.work + self._work(before, state, dt)
+        columns, momentum = self.columns(state), self._momentum(state)
+        motion = account.motion + (columns - account.now)
+        books, impulses, status = [], [momentum - self._momentum(before)], Status.ok()
+        for rule in self.rules:
+            state, seen = rule.update(before, state, dt)
+            status = status.then(seen)
+            columns_after, momentum_after = self.columns(state), self._momentum(state)
+            books.append(columns_after - columns)
+            impulses.append(momentum_after - momentum)
+            columns, momentum = columns_after, momentum_after
+        rules = account.rules + jnp.stack(books) if books else account.rules
+        new = Account(account.start, columns, work, motion, rules, account.impulses + jnp.stack(impulses))
+        return dataclasses.replace(state, ledger=new), status
+
+    def columns(self, state: State) -> Array:
+        """(2 + F,) kinetic energy, potential of each force (0 where there is none), heat [J]."""
+        kinetic = 0.5 * jnp.sum(self._mass(state) * state.velocity.dot(state.velocity))
+        zero = jnp.zeros((), state.dtype)
+        stored = [zero if e is None else e for e in (f.energy(state) for f in self._forces())]
+        heat = sum((total_heat(r, state) for r in self.rules if isinstance(r, Heat)), start=zero)
+        return jnp.stack([kinetic, *stored, heat])
+
+    def _work(self, before: State, after: State, dt: Array) -> Array:
+        """(F,) work of drag and of forces without potential in one step [J]."""
+        mean = 0.5 * (before.velocity + after.velocity)
+        still = before.moved(before.position, Vector.zeros_like(before.velocity))
+        parts = []
+        for force in self._forces():
+            has_potential = force.energy(before) is not None
+            if has_potential and force.is_symmetric(before) and force.damping_bound(before) is None:
+                parts.append(jnp.zeros((), before.dtype))
+                continue
+            f = force.force(before)
+            f = f - force.force(still) if has_potential else f
+            parts.append(dt * jnp.sum(f.dot(mean)))
+        return jnp.stack(parts) if parts else jnp.zeros(0, before.dtype)
+
+    def _momentum(self, state: State) -> Array:
+        mass = self._mass(state)
+        return jnp.stack([jnp.sum(mass * a) for a in state.velocity])
+
+    def _forces(self) -> tuple[Force, ...]:
+        if self.forces is None:
+            raise ValueError("Ledger knows no forces yet. Put it in System(rules=...), and call rollout, or system.prepare(dtype).")
+        return self.forces
+
+    def _mass(self, state: State) -> Array:
+        self._forces()
+        return jnp.asarray(self.mass, state.dtype)
+
+
+def energy_ledger(system: Any, state: State) -> dict[str, Any]:
+    """The books of a run as names and numbers; for the host.
+
+    Args:
+        system: whose rule is a `Ledger`.
+        state: the last of a rollout.
+
+    Returns:
+        `start`, `end`: energy by column [J]. `work`: of drag and forces without potential [J]. `rules`: what each rule changed, by column
+        [J]. `integration`: the stepper's own error [J]. `residual`: what is left, rounding [J]. `impulses`: momentum that motion and each
+        rule gave [kg m/s].
+
+    Raises:
+        ValueError: no ledger in the system, or none in the state.
+    """
+    ledger = next((rule for rule in system.rules or () if isinstance(rule, Ledger)), None)
+    if ledger is None or not isinstance(state.ledger, Account):
+        raise ValueError("there is no ledger. Pass rules=Ledger(rules) to System, and a state that came out of rollout.")
+    account = state.ledger
+    forces, rules = _names(system.forces), _names(ledger.rules)
+    columns = ("kinetic", *forces, "heat")
+    start, now, work, motion, books = (
+        np.asarray(a, np.float64) for a in (account.start, account.now, account.work, account.motion, account.rules)
+    )
+    integration = float(np.sum(motion) - np.sum(work))
+
+    def named(values: np.ndarray) -> dict[str, float]:
+        return dict(zip(columns, map(float, values), strict=True))
+
+    return {
+        "start": named(start),
+        "end": named(now),
+        "work": dict(zip(forces, map(float, work), strict=True)),
+        "rules": {name: named(row) for name, row in zip(rules, books, strict=True)},
+        "integration": integration,
+        "residual": float(np.sum(now - start) - np.sum(work) - integration - np.sum(books)),
+        "impulses": dict(zip(("motion", *rules), np.asarray(account.impulses, np.float64).tolist(), strict=True)),
+    }
+
+
+def _names(effects: tuple[Any, ...]) -> tuple[str, ...]:
+    """Class names, numbered where there are two of a kind."""
+    kinds = [type(effect).__name__ for effect in effects]
+    return tuple(kind if kinds.count(kind) == 1 else f"{kind} {kinds[:i].count(kind) + 1}" for i, kind in enumerate(kinds))
+
+
+__all__ = ["Account", "Ledger", "energy_ledger"]

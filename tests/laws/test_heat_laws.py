@@ -1,0 +1,112 @@
+"""Heat is kept and makes no new extreme, whatever the body, the step and the scheme: properties of random bodies."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+import jaxspring as js
+from jaxspring.status import Flag
+
+NET = js.lattice((3, 4))
+GRAPH = js.Graph.from_edges(NET.edges[::-1], 12)
+IMPLICIT = [js.BackwardEulerHeat(), js.CrankNicolsonHeat(), js.SplitHeat()]
+
+
+@eqx.filter_jit
+def run(scheme, net, c, g, t, latent, q, dt):
+    """Status, temperatures, and heat at the start, at the end and brought in, after five steps."""
+    heat = js.Heat(net, c, g, scheme, source=net.node_field(q), latent=latent)
+    system = js.System(net, 1.0, rules=heat)
+    start = system.begin(js.State.from_points(net, NET.grid(), temperature=t))
+    result = js.rollout(system, start, js.Still(), dt, 5)
+    total = [js.total_heat(heat, state) for state in (start, result.state)]
+    return result.status, result.state.temperatures, total, 5 * dt * jnp.sum(q)
+
+
+def body(seed):
+    """Capacities, conductances over six decades (some zero) and temperatures of a random body."""
+    rng = np.random.default_rng(seed)
+    g = 10 ** rng.uniform(-3, 3, 17) * (rng.random(17) > 0.1)
+    return rng, jnp.asarray(10 ** rng.uniform(-1, 1, 12)), jnp.asarray(g), jnp.asarray(rng.uniform(300, 400, 12))
+
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", IMPLICIT, ids=lambda s: type(s).__name__)
+@pytest.mark.parametrize("melts", [False, True], ids=["sensible", "latent"])
+@settings(max_examples=40)
+@given(seed=seeds, log_dt=st.floats(-4, 3), log_latent=st.floats(-1, 3), heated=st.booleans())
+def test_heat_is_kept(scheme, melts, seed, log_dt, log_latent, heated):
+    """Capacities, conductances, dt and latent heat over decades: what the body has gained is what its sources gave, to rounding, though
+    solves end at 1e-8.
+    """
+    rng, c, g, t = body(seed)
+    latent = js.LatentHeat(350.0, jnp.asarray(10**log_latent)) if melts else None
+    q = jnp.asarray(rng.normal(size=12) * heated)
+    status, end, (before, after), given_heat = run(scheme, NET, c, g, t, latent, q, jnp.asarray(10**log_dt))
+    scale = float(before) + float(jnp.sum(jnp.abs(q))) * 5 * 10**log_dt
+    # Half an explicit step of Crank-Nicolson moves up to dt G theta about, whose rounding is kept.
+    moved = 10**log_dt * 1e3 * 100 if isinstance(scheme, js.CrankNicolsonHeat) else 0.0
+    assert abs(float(after - before - given_heat)) <= 1e-12 * (scale + moved)
+    assert np.all(np.isfinite(end))
+    if log_dt < 0:
+        assert not bool(status.has(Flag.SOLVER))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", [IMPLICIT[0], IMPLICIT[2]], ids=lambda s: type(s).__name__)
+@pytest.mark.parametrize("melts", [False, True], ids=["sensible", "latent"])
+@settings(max_examples=40)
+@given(seed=seeds, log_dt=st.floats(-4, 6), log_latent=st.floats(-1, 3))
+def test_no_new_extreme(scheme, melts, seed, log_dt, log_latent):
+    """Without sources no node becomes hotter than the hottest or colder than the coldest was, at any dt, to the solver's tolerance."""
+    _, c, g, t = body(seed)
+    latent = js.LatentHeat(350.0, jnp.asarray(10**log_latent)) if melts else None
+    status, end, _, _ = run(scheme, NET, c, g, t, latent, jnp.zeros(12), jnp.asarray(10**log_dt))
+    if bool(status.is_ok):
+        slack = 1e-4 * float(jnp.ptp(t))
+        assert float(jnp.min(t)) - slack <= float(jnp.min(end)) <= float(jnp.max(end)) <= float(jnp.max(t)) + slack
+    assert np.all(np.isfinite(end))
+
+
+@pytest.mark.slow
+@settings(max_examples=40)
+@given(seed=seeds, share=st.floats(0.01, 1.0), log_latent=st.floats(-1, 3))
+@example(seed=0, share=1.0, log_latent=0.0)
+def test_explicit_heat_up_to_its_limit(seed, share, log_latent):
+    """At any share of the reported limit: no new extreme, and heat kept to 1e-13, with latent heat."""
+    _, c, g, t = body(seed)
+    heat = js.Heat(NET, c, g)
+    limit = float(js.stable_dt(js.System(NET, 1.0, rules=heat), js.State.from_points(NET, NET.grid(), temperature=t)))
+    latent = js.LatentHeat(350.0, jnp.asarray(10**log_latent))
+    status, end, (before, after), _ = run(js.ExplicitHeat(), NET, c, g, t, latent, jnp.zeros(12), jnp.asarray(min(share * limit, 1e3)))
+    assert not bool(status.has(Flag.DT_LIMIT))
+    assert float(jnp.min(t)) - 1e-10 <= float(jnp.min(end)) <= float(jnp.max(end)) <= float(jnp.max(t)) + 1e-10
+    assert float(after) == pytest.approx(float(before), rel=1e-13)
+
+
+@pytest.mark.slow
+def test_a_graph_is_its_lattice(rng):
+    """The same springs as a graph, in another order, give the lattice's temperatures, implicit and with latent heat."""
+    _, c, g, t = body(7)
+    latent = js.LatentHeat(350.0, 30.0)
+    scheme = js.BackwardEulerHeat(js.JaxCG(1e-13), js.HeatIteration(1e-13))
+    on_lattice = run(scheme, NET, c, g, t, latent, jnp.ones(12), jnp.asarray(0.5))[1]
+    on_graph = run(scheme, GRAPH, c, g[::-1], t, latent, jnp.ones(12), jnp.asarray(0.5))[1]
+    np.testing.assert_allclose(on_graph, on_lattice, rtol=1e-10)
+
+
+def test_float32_stays_float32(dtype):
+    """Temperatures and enthalpies keep the state's precision, whatever that of the constants, with heat kept to its rounding."""
+    heat = js.Heat(NET, 1.0, np.full(17, 0.2), js.BackwardEulerHeat(), latent=js.LatentHeat(350.0, 20.0))
+    start = js.State.from_points(NET, NET.grid().astype(dtype), temperature=np.linspace(300, 400, 12))
+    system = js.System(NET, 1.0, rules=heat)
+    end = js.rollout(system, start, js.Still(), 0.7, 20).state
+    assert end.temperature.dtype == end.enthalpy.dtype == dtype
+    gain = float(js.total_heat(heat, end) / js.total_heat(heat, system.begin(start))) - 1
+    assert abs(gain) <= 100 * np.finfo(dtype).eps

@@ -1,0 +1,191 @@
+"""Heat against closed forms: discrete modes, slabs, tensors, cells, boundaries; what is refused, and how."""
+
+import dataclasses
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxspring as js
+
+FINE = js.JaxCG(tolerance=1e-14)
+SCHEMES = [js.ExplicitHeat(), js.BackwardEulerHeat(FINE), js.CrankNicolsonHeat(FINE), js.SplitHeat()]
+
+
+def name(scheme):
+    return type(scheme).__name__
+
+
+def run(heat, temperature, dt, n_steps, net=None, points=None):
+    """The rollout of a body that does not move."""
+    net = heat.net if net is None else net
+    start = js.State.from_points(net, net.grid() if points is None else points, temperature=temperature)
+    result = js.rollout(js.System(net, 1.0, rules=heat), start, js.Still(), dt, n_steps)
+    js.raise_for_status(result)
+    return result.state
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", SCHEMES, ids=name)
+def test_a_cosine_decays_by_its_discrete_factor(scheme):
+    """On equal cells a product of cosines is a mode: each scheme multiplies it by its own factor a step, to 1e-12."""
+    net, dt, g, c = js.lattice((6, 5, 4)), 0.3, 0.7, 1.3
+    mode, rates = np.ones(net.shape), []
+    for axis, (n, p) in enumerate(zip(net.shape, (2, 1, 3), strict=True)):
+        shape = [n if a == axis else 1 for a in range(3)]
+        mode = mode * np.cos(p * np.pi * (np.arange(n) + 0.5) / n).reshape(shape)
+        rates.append(4 * g / c * np.sin(p * np.pi / (2 * n)) ** 2)
+    total = sum(rates)
+    factor = {
+        "ExplicitHeat": 1 - dt * total,
+        "BackwardEulerHeat": 1 / (1 + dt * total),
+        "CrankNicolsonHeat": (1 - dt * total / 2) / (1 + dt * total / 2),
+        "SplitHeat": 1 / np.prod([1 + dt * r for r in rates]),
+    }[name(scheme)]
+    end = run(js.Heat(net, c, g, scheme), mode.ravel(), dt, 5)
+    np.testing.assert_allclose(end.temperature, mode * factor**5, atol=1e-12)
+
+
+def test_the_sine_of_the_reference_page():
+    """32 intervals between ends at zero, r = 0.4, 200 steps of sin(pi x): the middle is 0.4621196155, the discrete formula to 1e-14."""
+    net = js.lattice(33)
+    x = np.arange(33) / 32
+    ends = js.FixedTemperature(net, (np.arange(33) % 32) == 0, 0.0)
+    end = run(js.Heat(net, 1.0, 0.4, boundaries=ends), np.sin(np.pi * x), 1.0, 200)
+    assert float(end.temperature[16]) == pytest.approx((1 - 1.6 * np.sin(np.pi / 64) ** 2) ** 200, rel=1e-13)
+    assert float(end.temperature[16]) == pytest.approx(0.4621196155, abs=1e-10)
+
+
+@pytest.mark.slow
+def test_the_interface_of_a_two_layer_slab():
+    """Steady ends at T1, T2: the interface is (c1 T1/d1 + c2 T2/d2) / (c1/d1 + c2/d2) with harmonic means; arithmetic ones miss it."""
+    n, k, h = 12, 5, 0.1
+    net = js.lattice(n)
+    c = np.where(np.arange(n) <= k, 1.0, 0.2)
+    t1, t2, d1, d2 = 400.0, 300.0, (k + 0.5) * h, (n - 1 - k - 0.5) * h
+    expected = (1.0 * t1 / d1 + 0.2 * t2 / d2) / (1.0 / d1 + 0.2 / d2)
+    ends = (js.FixedTemperature(net, np.arange(n) == 0, t1), js.FixedTemperature(net, np.arange(n) == n - 1, t2))
+
+    def interface(conductance):
+        heat = js.Heat(net, 1.0, conductance, js.BackwardEulerHeat(js.Skyline(net)), boundaries=ends)
+        t = np.asarray(run(heat, 350.0, 1e6, 3).temperature)
+        return t[k] + (t[k - 1] - t[k]) * -0.5  # half a spacing on, with the slope of the first layer
+
+    assert interface(js.conductances(net, c, h, section=1e-2)) == pytest.approx(expected, abs=1e-8)
+    arithmetic = 1e-2 / h * 0.5 * (c[1:] + c[:-1])
+    assert abs(interface(arithmetic) - expected) > 0.5
+
+
+@pytest.mark.slow
+def test_a_tensor_conducts_what_it_says():
+    """On theta = x'Ax/2 inside an anisotropic sheet the heat that enters a node is V tr(C A), to rounding; so in a block."""
+    for shape, spacing, tensor in [
+        ((5, 6), (0.3, 0.2), np.array([[3.0, 1.1], [1.1, 2.0]])),
+        ((4, 5, 5), (0.3, 0.3, 0.2), np.array([[3.0, 0.4, -0.5], [0.4, 2.5, 0.3], [-0.5, 0.3, 2.0]])),
+    ]:
+        dim = len(shape)
+        net = js.lattice(shape, js.STRUCTURAL + js.SHEAR)
+        a = np.random.default_rng(1).normal(size=(dim, dim))
+        a = a + a.T
+        x = net.grid(spacing)
+        heat = js.Heat(net, 1.0, js.conductances(net, tensor, spacing, section=0.5 if dim == 2 else 1.0))
+        state = js.State.from_points(net, x, temperature=0.5 * np.einsum("ni,ij,nj->n", x, a, x))
+        inner = heat.power(state)[(slice(1, -1),) * dim]
+        volume = np.prod(spacing) * (0.5 if dim == 2 else 1.0)
+        np.testing.assert_allclose(inner, volume * np.trace(tensor @ a), rtol=1e-10)
+
+
+def test_cells_fill_the_body():
+    """Equal cells add up to n h along each axis, half cells to (n - 1) h; a linear profile carries the same heat through every link."""
+    net, spacing = js.lattice((3, 4)), (0.5, 0.2)
+    assert float(js.EqualCells().volumes(net, spacing, 0.1).sum()) == pytest.approx(4 * 0.5 * 3 * 0.2 * 0.1)
+    assert float(js.HalfCells().volumes(net, spacing, 0.1).sum()) == pytest.approx(3 * 0.5 * 2 * 0.2 * 0.1)
+    half = js.conductances(net, 2.0, spacing, 0.1, js.HalfCells())
+    along_x = np.asarray(net.flatten(half))[:9].reshape(3, 3)
+    np.testing.assert_allclose(along_x, 2.0 * 0.1 * 0.2 / 0.5 * np.array([[0.5], [1.0], [0.5]]) * np.ones(3))
+    c = js.capacities(net, 1000.0, 4.0, spacing, 0.1, js.HalfCells())
+    np.testing.assert_allclose(c, 4000.0 * np.asarray(js.HalfCells().volumes(net, spacing, 0.1)))
+
+
+def test_boundaries_by_hand(rng):
+    """Flux, convection, radiation and a hot plane give each node the heat of their formulas, on a graph in the user's order."""
+    net = js.Graph.from_edges([(3, 0), (0, 2), (2, 1)], 4)
+    t, nodes = rng.uniform(300, 900, 4), np.array([True, False, True, True])
+    h, area, flux = rng.uniform(1, 9, 4), rng.uniform(0.1, 1, 4), rng.normal(size=4)
+    points = np.c_[rng.normal(size=(4, 2)), [0.0, 0.05, 0.15, 0.3]]
+    plane = js.HotPlane((0, 0, 0), (0, 0, 2), 1000.0, 7.0, 0.5, reach=0.1, fade=0.1)
+    terms = [
+        (js.HeatFlux(net, nodes, flux, area), nodes * flux * area),
+        (js.Convection(net, nodes, h, 280.0, area), nodes * h * area * (280.0 - t)),
+        (js.Radiation(net, nodes, 0.8, lambda time: 500.0 + time, area), nodes * 0.8 * 5.670374419e-8 * area * (500.0**4 - t**4)),
+        (plane, np.array([1, 1, 0.5, 0]) * 7.0 * 0.5 * (1000.0 - t)),
+        (js.HotPlane((0, 0, 0), (0, 0, 1), 1000.0, 7.0, 0.5, reach=0.1), np.array([1, 1, 0, 0]) * 3.5 * (1000.0 - t)),
+    ]
+    state = js.State.from_points(net, points, temperature=t)
+    for boundary, expected in terms:
+        heat = js.Heat(net, 1.0, 0.0, boundaries=boundary, source=np.arange(4.0))
+        np.testing.assert_allclose(net.flatten_nodes(heat.power(state)), expected + np.arange(4.0), rtol=1e-12)
+        np.testing.assert_allclose(heat.supplied(state), heat.power(state))
+        slope = boundary.slope(state, state.temperature)
+        by_hand = js.ThermalBoundary.slope(boundary, state, state.temperature)
+        np.testing.assert_allclose(jnp.zeros(4) if slope is None else slope, by_hand, rtol=1e-12)
+
+
+def test_springs_that_broke_do_not_conduct():
+    """With `cut_by`, a broken structural spring of a sheared net conducts nothing; without it, or without memory of breaks, an error."""
+    net, body = js.lattice((2, 3)), js.lattice((2, 3), js.STRUCTURAL + js.SHEAR)
+    start = js.State.from_points(body, body.grid(), temperature=np.arange(6.0))
+    whole = np.ones(body.n_springs, bool)
+    whole[[0, 2]] = False  # both springs between the first two columns
+    alive = js.EdgeField(tuple(a > 0.5 for a in body.split(jnp.asarray(whole, float)).families))
+    heat = js.Heat(net, 1.0, 1.0, cut_by=body)
+    cut = heat.power(dataclasses.replace(start, alive=alive))
+    np.testing.assert_allclose(jnp.ravel(cut), [3, 1 + 3, -1 + 3, -3, 1 - 3, -1 - 3], atol=1e-14)
+    with pytest.raises(ValueError, match="alive` is None"):
+        heat.power(start)
+    with pytest.raises(ValueError, match="every spring of net is one of cut_by"):
+        js.Heat(body, 1.0, 1.0, cut_by=net)
+    with pytest.raises(ValueError, match="same order"):
+        js.Heat(js.Graph.from_edges([(0, 1)], 3), 1.0, 1.0, cut_by=js.Graph.from_edges([(1, 2)], 3))
+
+
+def test_refusals():
+    """What cannot be honoured is an error that names it."""
+    net, sheet = js.lattice(3), js.lattice((3, 3), js.STRUCTURAL + js.SHEAR)
+    for error, match, make in [
+        (ValueError, r"capacity\[1\] = 0.0", lambda: js.Heat(net, [1.0, 0.0, 1.0], 1.0)),
+        (ValueError, r"conductance\[0\] = -1.0", lambda: js.Heat(net, 1.0, [-1.0, 1.0])),
+        (ValueError, "substeps = 0", lambda: js.Heat(net, 1.0, 1.0, substeps=0)),
+        (TypeError, "scheme is a str", lambda: js.Heat(net, 1.0, 1.0, "explicit")),
+        (TypeError, r"boundaries\[0\] is a int", lambda: js.Heat(net, 1.0, 1.0, boundaries=(3,))),
+        (ValueError, "axes, but springs", lambda: js.Heat(sheet, 1.0, 1.0, js.SplitHeat())),
+        (ValueError, "this net is a Graph", lambda: js.Heat(js.Graph.from_edges([(0, 1)], 2), 1.0, 1.0, js.SplitHeat())),
+        (ValueError, "periodic axis", lambda: js.Heat(js.lattice(5, periodic=True, box=[5.0]), 1.0, 1.0, js.SplitHeat())),
+        (TypeError, "expected booleans", lambda: js.FixedTemperature(net, [0, 1, 2], 300.0)),
+        (ValueError, "normal has no length", lambda: js.HotPlane((0, 0), (0, 0), 300.0, 1.0, 1.0, 0.1)),
+        (ValueError, "latent = -1.0", lambda: js.LatentHeat(300.0, -1.0)),
+        (ValueError, "too oblique|Tensor", lambda: js.conductances(sheet, [[1.0, 0.0], [0.0, 1.0]] + 2 * (1 - np.eye(2)), 1.0)),
+        (ValueError, "not symmetric", lambda: js.conductances(sheet, np.array([[1.0, 0.5], [0.0, 1.0]]), 1.0)),
+        (ValueError, "STRUCTURAL", lambda: js.conductances(js.lattice((3, 3)), np.array([[1.0, 0.5], [0.5, 1.0]]), 1.0)),
+        (ValueError, "of a lattice", lambda: js.capacities(js.Graph.from_edges([(0, 1)], 2), 1.0, 1.0, 1.0)),
+        (ValueError, "tolerance", lambda: js.HeatIteration(tolerance=-1.0)),
+    ]:
+        with pytest.raises(error, match=match):
+            make()
+    cold = js.State.from_points(net, net.grid())
+    with pytest.raises(ValueError, match="needs a temperature"):
+        js.System(net, 1.0, rules=js.Heat(net, 1.0, 1.0)).begin(cold)
+    wet = dataclasses.replace(cold, temperature=jnp.ones(3), enthalpy=jnp.ones(3))
+    with pytest.raises(ValueError, match="knows no melting"):
+        js.System(net, 1.0, rules=js.Heat(net, 1.0, 1.0)).begin(wet)
+
+
+def test_a_bad_constant_that_slipped_in_is_reported():
+    """A negative capacity put in after construction, and a step backward in time, give INVALID."""
+    net = js.lattice(3)
+    heat = js.Heat(net, 1.0, 0.1, js.BackwardEulerHeat())
+    start = js.State.from_points(net, net.grid(), temperature=300.0)
+    bad = eqx.tree_at(lambda h: h.capacity, heat, jnp.asarray(-1.0))
+    assert bool(js.rollout(js.System(net, 1.0, rules=bad), start, js.Still(), 0.1, 1).status.has(js.Flag.INVALID))
+    assert bool(js.rollout(js.System(net, 1.0, rules=heat), start, js.Still(), -0.1, 1).status.has(js.Flag.INVALID))

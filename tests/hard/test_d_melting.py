@@ -36,7 +36,7 @@ def test_d10_smooth_melting_has_the_right_derivative(melting):
 
 @pytest.mark.slow
 def test_d10_hard_melting_has_derivative_zero():
-    """D10: where no spring is between softening and melting, the hard model's derivative is 0, as are its differences; it jumps elsewhere."""
+    """D10: where no spring is between softening and melting, the hard model's derivative and differences are 0."""
     step = np.array([300.0, 300.0, 300.0, 420.0, 420.0])
 
     def f(melting):

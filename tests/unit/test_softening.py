@@ -25,7 +25,7 @@ def stiffness_at(theta, sharpness=None):
 
 @pytest.mark.parametrize(("theta", "share"), [(200.0, 1), (300.0, 1), (350.0, 0.5), (400.0, 0), (500.0, 0)])
 def test_ramp(theta, share):
-    """k = k0 up to theta_s, k0 / 2 in the middle, 0 from theta_m on."""
+    """Stiffness is k0 up to theta_s, k0 / 2 in the middle, 0 from theta_m on."""
     assert stiffness_at(theta) == pytest.approx(80 * share, abs=1e-12)
 
 

@@ -86,7 +86,7 @@ class Ledger(Rule):
     @property
     def net(self) -> Topology | None:
         """The topology of the first rule that has one."""
-        return next((r.net for r in self.rules if getattr(r, "net", None) is not None), None)
+        return next((net for net in (getattr(r, "net", None) for r in self.rules) if net is not None), None)
 
     def with_mass(self, mass: Array) -> Ledger:
         """The same, knowing the masses [kg]."""
@@ -157,7 +157,7 @@ class Ledger(Rule):
         is_moved = last is None or known is None or last.position is not state.position or last.alive is not state.alive
         stored = []
         for i, force in enumerate(self._forces()):
-            energy = force.energy(state) if is_moved or not isinstance(force, Fluid) else known[1 + i]
+            energy = force.energy(state) if is_moved or known is None or not isinstance(force, Fluid) else known[1 + i]
             stored.append(zero if energy is None else energy)
         heat = sum((total_heat(r, state) for r in self.rules if isinstance(r, Heat)), start=zero)
         return jnp.stack([kinetic, *stored, heat])

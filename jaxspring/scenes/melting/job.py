@@ -22,7 +22,7 @@ from ...state import State
 from ...status import Flag
 from ...steppers.explicit import SymplecticEuler
 from ...thermal.fusing import melted_fraction
-from ...thermal.ledger import energy_ledger
+from ...thermal.ledger import Ledger, energy_ledger
 from .pictures import draw_animation, draw_strip
 from .scene import Melting, MeltSettings, melting_block
 
@@ -131,7 +131,7 @@ def exchanged(book: dict[str, Any]) -> float:
 def seconds_per_effect(scene: Melting, end: State, repeats: int = 10) -> dict[str, float]:
     """Seconds of one evaluation of each force and rule at the end of the run, compiled, the fastest of a few [s]."""
     ready = scene.system.prepare(end.dtype)
-    rules = ready.rules[0].rules if ready.rules else ()
+    rules = tuple(rule for book in ready.rules or () if isinstance(book, Ledger) for rule in book.rules)
     dt = jax.numpy.zeros((), end.dtype)
     found = {}
     for force in ready.forces:

@@ -55,7 +55,7 @@ def _panel(axes: Any, frames: Any, i: int, settings: MeltSettings) -> Any:
     centimetres = 100 * frames.points
     x, y, z = centimetres[i].T
     dots = axes.scatter(
-        x, y, z, c=frames.temperatures[i], cmap="inferno", vmin=settings.start, vmax=settings.plate, s=22, edgecolors="0.3", linewidths=0.2,
+        x, y, z, c=frames.temperatures[i], cmap="inferno", vmin=settings.start, vmax=settings.plate, s=60, edgecolors="0.3", linewidths=0.2,
         depthshade=False,
     )  # fmt: skip
     half = float(np.percentile(np.abs(centimetres[..., :2]), 99.5)) * 1.05

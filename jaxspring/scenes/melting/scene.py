@@ -120,7 +120,7 @@ def melting_block(settings: MeltSettings | None = None, dtype: jnp.dtype | None 
     net = lattice((nz, ny, nx), springs=STRUCTURAL + SHEAR)
     along = lattice((nz, ny, nx), springs=STRUCTURAL)
     points = jnp.asarray(net.grid(s.spacing), dtype)
-    points = points - jnp.asarray([(nx - 1) * s.spacing / 2, (ny - 1) * s.spacing / 2, 0.0], dtype)
+    points = points - jnp.asarray([(nx - 1) * s.spacing / 2, (ny - 1) * s.spacing / 2, 0.0], dtype)[None, :]
     mass = s.density * s.spacing**3
     springs = Springs(net, ThermalStiffness(s.stiffness, s.softening, s.vanishing), net.lengths(points))
     fluid = Fluid(

@@ -1,4 +1,4 @@
-"""The command `jaxspring`: fit a spring mesh to an image, without writing a program.
+"""The command `jaxspring`: fit a spring mesh to an image, or melt a block, without writing a program.
 
 Exit codes: 0 done; 1 the fit failed; 2 the arguments or the image cannot be used; 130 interrupted. Trouble is one line on the error stream.
 Everything heavy is imported after the arguments are understood, so that `--help` and mistakes answer at once.
@@ -21,6 +21,7 @@ LAW = ("k_min", "k_max", "sigma", "k_data", "drag")
 # As SpringSettings and ConstantsSettings have them; a test compares. Repeated so that `--help` loads no JAX.
 UPDATES_OF_STIFFNESS, UPDATES_OF_CONSTANTS = 700, 100
 PARAMETERS = ("stiffness", "k_pixel", *LAW)
+LARGEST_BLOCK = 4_096  # particles: every pair of them is looked at in every step
 LARGEST_MESH = 4_000_000  # nodes: beyond, one rollout alone takes minutes
 
 
@@ -45,6 +46,21 @@ class Arguments:
     resume: bool
 
 
+@dataclass(frozen=True)
+class MeltArguments:
+    """What `jaxspring melt` was asked to do.
+
+    Attributes:
+        nodes: along x, y and z, or None for the scene's own.
+        duration: [s], or None for the scene's own.
+        out: folder for the results.
+    """
+
+    nodes: tuple[int, int, int] | None
+    duration: float | None
+    out: pathlib.Path
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with these arguments (those of the process unless given); returns its exit code."""
     try:
@@ -52,7 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SystemExit as ended:  # argparse: --help and --version with 0, a mistake with 2
         return int(ended.code or 0)
     try:
-        return run(arguments)
+        return melt(arguments) if isinstance(arguments, MeltArguments) else run(arguments)
     except KeyboardInterrupt:
         return complain("interrupted before the first iteration; nothing was written.", INTERRUPTED)
     except BrokenPipeError:
@@ -60,9 +76,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         return FAILED
 
 
-def parse(argv: Sequence[str]) -> Arguments:
+def parse(argv: Sequence[str]) -> Arguments | MeltArguments:
     """Arguments as typed, checked. Ends the process with code 2 and one line where they make no sense."""
     given = _parser().parse_args(argv)
+    if given.command == "melt":
+        return MeltArguments(given.nodes, given.duration, pathlib.Path(given.out))
     image = None if given.image is None else pathlib.Path(given.image)
     out = pathlib.Path(given.out or f"jaxspring-{'elevation' if image is None else image.stem or 'image'}")
     usual = UPDATES_OF_STIFFNESS if given.parameters == ("stiffness",) else UPDATES_OF_CONSTANTS
@@ -92,6 +110,31 @@ def run(arguments: Arguments) -> int:
         return complain(outcome.failure, FAILED)
     print(outcome.table)
     print(f"Written to {arguments.out}{os.sep}: report.json, mesh.npz and {len(outcome.pictures)} pictures.")
+    return DONE
+
+
+def melt(arguments: MeltArguments) -> int:
+    """Melt a block and write the folder; returns the exit code."""
+    try:
+        check_folder(arguments.out)
+    except OSError as error:
+        return complain(str(error), UNUSABLE)
+    from .progress import Progress
+    from .scenes.melting.job import melt as melted
+    from .scenes.melting.scene import MeltSettings
+
+    given = {"nodes": arguments.nodes, "duration": arguments.duration}
+    settings = MeltSettings(**{name: value for name, value in given.items() if value is not None})
+    try:
+        outcome = melted(settings, arguments.out, Progress("melt"))
+    except (OSError, ImportError, MemoryError) as error:
+        return complain(str(error) or "there is not enough memory.", UNUSABLE)
+    if outcome.is_interrupted:
+        return complain("interrupted; nothing was written.", INTERRUPTED)
+    if outcome.failure:
+        return complain(outcome.failure, FAILED)
+    print(outcome.table)
+    print(f"Written to {arguments.out}{os.sep}: report.json, strip.png and melting.gif.")
     return DONE
 
 
@@ -156,7 +199,42 @@ def _parser() -> argparse.ArgumentParser:
     )
     fit.add_argument("--out", metavar="DIR", help="folder for the results (jaxspring-<image>); an older result there is replaced")
     fit.add_argument("--resume", action="store_true", help="go on from the checkpoint of an interrupted or finished run with the same DIR")
+    _add_melt(commands)
     return parser
+
+
+def _add_melt(commands: argparse._SubParsersAction) -> None:
+    melting = commands.add_parser(
+        "melt",
+        help="melt a block on a hot plate",
+        description="A block of springs on a hot plate conducts, softens, melts and spreads; writes a report, pictures and an animation.",
+        allow_abbrev=False,
+    )
+    melting.add_argument("--nodes", type=block, metavar="NXxNYxNZ", help="particles of the block along x, y and z")
+    melting.add_argument("--duration", type=seconds, metavar="S", help="simulated time in seconds")
+    melting.add_argument("--out", metavar="DIR", default="jaxspring-melt", help="folder for the results; an older result there is replaced")
+
+
+def block(text: str) -> tuple[int, int, int]:
+    """`8x8x8` as (8, 8, 8)."""
+    parts = text.lower().split("x")
+    if len(parts) != 3 or not all(part.isascii() and part.isdigit() and len(part) < 5 for part in parts):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of particles along x, y and z such as 8x8x8")
+    nx, ny, nz = (int(part) for part in parts)
+    if min(nx, ny, nz) < 2 or nx * ny * nz > LARGEST_BLOCK:
+        raise argparse.ArgumentTypeError(f"{text!r}: a block has 2 particles or more each way, and {LARGEST_BLOCK} at most in all")
+    return nx, ny, nz
+
+
+def seconds(text: str) -> float:
+    """A time above zero, at most a minute."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0.01 <= value <= 60:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a time from 0.01 to 60 seconds")
+    return value
 
 
 def nodes(text: str) -> tuple[int, int]:

@@ -77,7 +77,7 @@ class Floor(Rule):
         s, n, v = self.height(state), self._of(self.normal, state), state.velocity
         zero = jnp.zeros((), s.dtype)
         lift = jnp.maximum(-s, zero)
-        inward = -sum((b * a for b, a in zip(n[1:], v[1:], strict=True)), start=n[0] * v[0])
+        inward = -sum((b * a for b, a in zip(n[1:], v.components[1:], strict=True)), start=n[0] * v[0])
         stop = jnp.where(s < 0, jnp.maximum(inward, zero), zero)
         impulse = (1 + self.restitution.astype(s.dtype)) * stop
         along = [a + b * inward for a, b in zip(v, n, strict=True)]

@@ -230,7 +230,8 @@ class Springs(Force):
     def natural_length(self, state: State) -> Array | EdgeField:
         """Rest length of each spring in this state [m]: the state's own where it has one, else the given one, times the expansion."""
         changed = state.rest_length
-        l = changed if self._is_of_this_net(changed) else cast_inexact(self.net.edge_field(self.rest_length, "rest_length"), state.dtype)
+        is_changed = changed is not None and self._is_of_this_net(changed)
+        l: Any = changed if is_changed else cast_inexact(self.net.edge_field(self.rest_length, "rest_length"), state.dtype)
         if self.expansion is None:
             return l
         return self.net.map_springs(lambda l, factor: l * factor, l, cast_inexact(self.expansion, state.dtype).factor(self.net, state))

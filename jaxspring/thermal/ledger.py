@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ..forces.base import Finding, Force, Rule
+from ..forces.fluid import Fluid
 from ..numerics import cast_inexact
 from ..state import State
 from ..status import Status
@@ -85,7 +86,7 @@ class Ledger(Rule):
     @property
     def net(self) -> Topology | None:
         """The topology of the first rule that has one."""
-        return next((r.net for r in self.rules if getattr(r, "net", None) is not None), None)
+        return next((net for net in (getattr(r, "net", None) for r in self.rules) if net is not None), None)
 
     def with_mass(self, mass: Array) -> Ledger:
         """The same, knowing the masses [kg]."""
@@ -135,9 +136,10 @@ class Ledger(Rule):
         motion = account.motion + (columns - account.now)
         books, impulses, status = [], [momentum - self._momentum(before)], Status.ok()
         for rule in self.rules:
+            moved = state
             state, seen = rule.update(before, state, dt)
             status = status.then(seen)
-            columns_after, momentum_after = self.columns(state), self._momentum(state)
+            columns_after, momentum_after = self.columns(state, moved, columns), self._momentum(state)
             books.append(columns_after - columns)
             impulses.append(momentum_after - momentum)
             columns, momentum = columns_after, momentum_after
@@ -145,11 +147,18 @@ class Ledger(Rule):
         new = Account(account.start, columns, work, motion, rules, account.impulses + jnp.stack(impulses))
         return dataclasses.replace(state, ledger=new), status
 
-    def columns(self, state: State) -> Array:
-        """(2 + F,) kinetic energy, potential of each force (0 where there is none), heat [J]."""
+    def columns(self, state: State, last: State | None = None, known: Array | None = None) -> Array:
+        """(2 + F,) kinetic energy, potential of each force (0 where there is none), heat [J].
+
+        `known` are the columns of the state `last`: a fluid whose particles are where they were is not summed again.
+        """
         kinetic = 0.5 * jnp.sum(self._mass(state) * state.velocity.dot(state.velocity))
         zero = jnp.zeros((), state.dtype)
-        stored = [zero if e is None else e for e in (f.energy(state) for f in self._forces())]
+        is_moved = last is None or known is None or last.position is not state.position or last.alive is not state.alive
+        stored = []
+        for i, force in enumerate(self._forces()):
+            energy = force.energy(state) if is_moved or known is None or not isinstance(force, Fluid) else known[1 + i]
+            stored.append(zero if energy is None else energy)
         heat = sum((total_heat(r, state) for r in self.rules if isinstance(r, Heat)), start=zero)
         return jnp.stack([kinetic, *stored, heat])
 

@@ -1,0 +1,1 @@
+"""A block that melts on a hot plate."""

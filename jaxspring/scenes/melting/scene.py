@@ -1,0 +1,152 @@
+"""A block on a hot plate: it conducts, softens, melts and spreads.
+
+    springs    structural and shear, k falls from softening to melting, then they fuse                      `ThermalStiffness`, `Fusing`
+    heat       along structural springs; the plate heats what touches it, Newton's term                     `Heat`, `HotPlane`
+    fluid      between particles that no spring holds any more, pairs at rest at the lattice's spacing        `Fluid`, `gentle_fluid`
+    loads      weight, drag, a floor with friction                                                          `Gravity`, `Drag`, `Floor`
+
+The material is like wax, but conducts some thousand times better, so that melting takes a second instead of an hour; the laws are the same
+under that scaling. The fluid's attraction is cut off smoothly at 1.4 spacings: without an end it would draw the whole melt into one point.
+
+Source: slides "Heating and Melting" and "Discrete Fluid Model"; constants are this library's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ...forces.contact import Floor
+from ...forces.cutoffs import Switched
+from ...forces.damping import Drag
+from ...forces.fluid import Fluid
+from ...forces.loads import Gravity
+from ...forces.molten import Molten
+from ...forces.pair_laws import gentle_fluid
+from ...forces.pairs import AllPairs
+from ...forces.springs import Springs
+from ...state import State
+from ...system import System
+from ...thermal.cells import capacities
+from ...thermal.conduction import conductances
+from ...thermal.fusing import Fusing
+from ...thermal.heat import Heat
+from ...thermal.hot_plane import HotPlane
+from ...thermal.ledger import Ledger
+from ...thermal.stiffness import ThermalStiffness
+from ...topology.lattice import SHEAR, STRUCTURAL, Lattice, lattice
+
+
+@dataclass(frozen=True)
+class MeltSettings:
+    """The scene in numbers.
+
+    Attributes:
+        nodes: along x, y and z.
+        spacing: of the lattice [m].
+        density: [kg/m^3]; of a node with the cell around it.
+        stiffness: of a cold spring [N/m].
+        drag: on every node [N s/m].
+        softening: where springs start to soften [K].
+        melting: where they fuse [K].
+        vanishing: where the falling stiffness would be zero [K]. Above the melting point: springs that lose all stiffness before they fuse
+            let layers fall into each other.
+        start: temperature of the block at first [K].
+        plate: temperature of the plate [K].
+        conductivity: [W/(m K)].
+        specific_heat: [J/(kg K)].
+        transfer: from the plate to what touches it [W/(m^2 K)].
+        attraction: alpha of the fluid [N m / kg^2].
+        friction: of the plate.
+        gravity: [m/s^2], downward.
+        dt: step [s].
+        duration: [s].
+    """
+
+    nodes: tuple[int, int, int] = (6, 6, 6)
+    spacing: float = 0.01
+    density: float = 900.0
+    stiffness: float = 200.0
+    drag: float = 1.5e-2
+    softening: float = 320.0
+    melting: float = 350.0
+    vanishing: float = 357.0
+    start: float = 300.0
+    plate: float = 420.0
+    conductivity: float = 3000.0
+    specific_heat: float = 2000.0
+    transfer: float = 5e5
+    attraction: float = 1000.0
+    friction: float = 0.1
+    gravity: float = 9.81
+    dt: float = 4e-4
+    duration: float = 1.0
+
+    @property
+    def n_steps(self) -> int:
+        """Steps of the run."""
+        return round(self.duration / self.dt)
+
+
+@dataclass(frozen=True)
+class Melting:
+    """The scene, ready to run.
+
+    Attributes:
+        net: structural and shear springs.
+        system: forces, and one rule, the ledger.
+        state: at the start.
+        heat: the rule of heat, for what it can tell.
+    """
+
+    net: Lattice
+    system: System
+    state: State
+    heat: Heat
+
+
+def melting_block(settings: MeltSettings | None = None, dtype: jnp.dtype | None = None) -> Melting:
+    """The block on its plate, at rest, its lowest nodes on the plate.
+
+    Args:
+        settings: `MeltSettings()` unless said.
+        dtype: of the state; JAX's default unless said.
+    """
+    s = MeltSettings() if settings is None else settings
+    dtype = jnp.result_type(float) if dtype is None else dtype
+    nx, ny, nz = s.nodes
+    net = lattice((nz, ny, nx), springs=STRUCTURAL + SHEAR)
+    along = lattice((nz, ny, nx), springs=STRUCTURAL)
+    points = jnp.asarray(net.grid(s.spacing), dtype)
+    points = points - jnp.asarray([(nx - 1) * s.spacing / 2, (ny - 1) * s.spacing / 2, 0.0], dtype)[None, :]
+    mass = s.density * s.spacing**3
+    springs = Springs(net, ThermalStiffness(s.stiffness, s.softening, s.vanishing), net.lengths(points))
+    fluid = Fluid(
+        gentle_fluid(s.spacing, alpha=s.attraction),
+        cutoff=Switched(1.05 * s.spacing, 1.4 * s.spacing),
+        pairs=AllPairs(),
+        core=0.2 * s.spacing,
+        molten=Molten(net),
+    )
+    ground, up = (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
+    plate = HotPlane(ground, up, s.plate, s.transfer, s.spacing**2, reach=0.25 * s.spacing, fade=0.5 * s.spacing)
+    heat = Heat(
+        along,
+        capacities(along, s.density, s.specific_heat, s.spacing),
+        conductances(along, s.conductivity, s.spacing),
+        boundaries=plate,
+    )
+    rules = Ledger((heat, Fusing(net, s.melting), Floor(ground, up, s.friction)))
+    system = System(net, mass, (springs, Gravity((0.0, 0.0, -s.gravity)), Drag(s.drag), fluid), rules=rules)
+    start = State.from_points(net, points, temperature=jnp.asarray(s.start, dtype))
+    return Melting(net, system, start, heat)
+
+
+def observed(state: State) -> tuple[Array, Array, Array, Array]:
+    """What a frame keeps: time [s], points (N, 3) [m], temperatures (N,) [K], columns of the ledger [J]."""
+    return state.time, state.points, state.temperatures, state.ledger.now
+
+
+__all__ = ["MeltSettings", "Melting", "melting_block", "observed"]

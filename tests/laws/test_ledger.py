@@ -1,0 +1,60 @@
+"""The energy ledger closes through melting, and its own error falls with dt."""
+
+import numpy as np
+import pytest
+
+import jaxspring as js
+
+NET = js.lattice((3, 4), js.STRUCTURAL + js.SHEAR)
+GROUND, UP = (0.0, 0.0), (0.0, 1.0)
+
+
+def melting_sheet(dt, duration=0.4):
+    """A stretched sheet with weight and drag that is heated from below until its lower springs fuse, over a floor."""
+    along = js.lattice((3, 4))
+    forces = (js.Springs(NET, js.ThermalStiffness(40.0, 310.0, 350.0), 0.9), js.Gravity((0.0, -6.0)), js.Drag(0.3))
+    heat = js.Heat(along, 1.0, 1.0, boundaries=js.HotPlane(GROUND, UP, 500.0, 6.0, 1.0, reach=0.5))
+    system = js.System(NET, 1.0, forces, rules=js.Ledger((heat, js.Fusing(NET, 350.0), js.Floor(GROUND, UP, 0.2))))
+    start = js.State.from_points(NET, NET.grid() + np.array([0.0, 0.02]), temperature=300.0)
+    run = js.rollout(system, start, js.SymplecticEuler(), dt, round(duration / dt))
+    js.raise_for_status(run)
+    return system, run.state, js.energy_ledger(system, run.state)
+
+
+@pytest.mark.slow
+def test_the_ledger_closes():
+    """All entries sum to the change of the energy; columns are the system's own energies; softening, fusing and heat are named."""
+    system, end, book = melting_sheet(2e-3)
+    assert abs(book["residual"]) < 1e-9
+    energy = system.energy(end)
+    assert book["end"]["kinetic"] == pytest.approx(float(energy.kinetic), rel=1e-12)
+    assert book["end"]["Springs"] == pytest.approx(float(energy.potential[0]), rel=1e-12)
+    rules = book["rules"]
+    assert 0 < NET.flatten(end.alive).sum() < NET.n_springs
+    assert rules["Heat"]["Springs"] < 0  # softened
+    assert rules["Heat"]["heat"] > 0
+    assert book["end"]["heat"] - book["start"]["heat"] == pytest.approx(rules["Heat"]["heat"], abs=1e-9)
+    assert rules["Fusing"]["kinetic"] == rules["Fusing"]["heat"] == 0
+    assert rules["Floor"]["kinetic"] < 0
+    assert book["work"]["Drag"] < 0
+    assert float(end.position.y.min()) >= 0
+    total = sum(np.asarray(p) for p in book["impulses"].values())
+    np.testing.assert_allclose(total, system.momentum(end), atol=1e-12)
+    np.testing.assert_array_equal(book["impulses"]["Fusing"], 0)
+
+
+@pytest.mark.slow
+def test_the_error_of_the_steps_falls_with_dt():
+    """What the ledger calls integration is of order one: an eighth of dt brings it to an eighth, within a third."""
+    coarse, fine = (abs(melting_sheet(dt)[2]["integration"]) for dt in (4e-3, 5e-4))
+    assert 5 < coarse / fine < 12
+
+
+def test_drag_is_the_work_of_drag():
+    """A free node slowed by drag loses what the ledger books, to rounding: a kick's work is dt F (v + v') / 2."""
+    net = js.lattice(1)
+    system = js.System(net, 2.0, js.Drag(0.5), rules=js.Ledger())
+    run = js.rollout(system, js.State.from_points(net, [[0.0]], [[3.0]]), js.SymplecticEuler(), 0.1, 10)
+    book = js.energy_ledger(system, run.state)
+    assert book["work"]["Drag"] == pytest.approx(book["end"]["kinetic"] - 9.0, rel=1e-13)
+    assert abs(book["integration"]) < 1e-13

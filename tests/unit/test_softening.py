@@ -1,0 +1,144 @@
+"""Stiffness, rest length and breaking as rules of temperature; the floor."""
+
+import dataclasses
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxspring as js
+
+CHAIN = js.lattice(5)
+SHEET = js.lattice((4, 5), js.STRUCTURAL + js.SHEAR)
+
+
+def warm(net, temperature, scale=1.0, **more):
+    return js.State.from_points(net, scale * net.grid(), temperature=temperature, **more)
+
+
+def stiffness_at(theta, sharpness=None):
+    net = js.lattice(2)
+    rule = js.ThermalStiffness(80.0, 300.0, 400.0, sharpness)
+    return float(net.flatten(rule.stiffness(net, warm(net, theta)))[0])
+
+
+@pytest.mark.parametrize(("theta", "share"), [(200.0, 1), (300.0, 1), (350.0, 0.5), (400.0, 0), (500.0, 0)])
+def test_ramp(theta, share):
+    """Stiffness is k0 up to theta_s, k0 / 2 in the middle, 0 from theta_m on."""
+    assert stiffness_at(theta) == pytest.approx(80 * share, abs=1e-12)
+
+
+def test_the_smooth_ramp_tends_to_the_hard_one():
+    """The largest difference over all temperatures is k0 ln 2 / b, and halves when b doubles."""
+    at = np.linspace(250, 450, 81)
+    hard = np.array([stiffness_at(t) for t in (300.0, 400.0)])
+    assert hard.tolist() == [80, 0]
+    for b in (20.0, 40.0):
+        gap = max(abs(stiffness_at(float(t), b) - 80 * np.clip((400 - t) / 100, 0, 1)) for t in at[::4])
+        assert gap == pytest.approx(80 * np.log(2) / b, rel=1e-6)
+
+
+def test_mean_of_the_ends():
+    """A spring between 300 K and 400 K is as one at 350 K."""
+    net = js.lattice(2)
+    rule = js.ThermalStiffness(80.0, 300.0, 400.0)
+    assert float(net.flatten(rule.stiffness(net, warm(net, [300.0, 400.0])))[0]) == pytest.approx(40)
+
+
+def test_expansion():
+    """A free chain heated by 100 K is at rest when longer by a * 100 K: no force there, and the closed form before it."""
+    springs = js.Springs(CHAIN, 7.0, 1.0, expansion=js.ThermalExpansion(2e-3, 300.0))
+    at_rest = js.System(CHAIN, 1.0, springs).force(warm(CHAIN, 400.0, 1.2))
+    np.testing.assert_allclose(at_rest.x, 0, atol=1e-14)
+    squeezed = js.System(CHAIN, 1.0, springs).force(warm(CHAIN, 400.0))
+    np.testing.assert_allclose(squeezed.x, [-1.4, 0, 0, 0, 1.4], atol=1e-14)
+
+
+def test_springs_with_thermal_stiffness_have_an_energy():
+    """Minus the gradient of the energy by position is the force, at any temperature."""
+    import jax
+
+    springs = js.Springs(SHEET, js.ThermalStiffness(80.0, 300.0, 400.0), 0.9)
+    state = warm(SHEET, np.linspace(280.0, 420.0, 20))
+    slope = jax.grad(lambda x: springs.energy(state.moved(x, state.velocity)))(state.position)
+    for a, b in zip(slope, springs.force(state), strict=True):
+        np.testing.assert_allclose(-a, b, atol=1e-12)
+
+
+def fused(temperature, net=CHAIN, refreezing=None, state=None, scale=1.3):
+    system = js.System(net, 1.0, js.Springs(net, 10.0, 1.0), rules=js.Fusing(net, 350.0, refreezing))
+    start = warm(net, temperature, scale) if state is None else dataclasses.replace(state, temperature=jnp.asarray(temperature))
+    return system, js.rollout(system, start, js.Still(), 0.1, 1).state
+
+
+def test_fusing_breaks_for_good():
+    """A spring whose mean is at the melting point or above breaks, and stays so when cold again."""
+    _, hot = fused([300.0, 300.0, 400.0, 400.0, 300.0])
+    assert CHAIN.flatten(hot.alive).tolist() == [True, False, False, False]
+    system, cold = fused([300.0] * 5, state=hot)
+    assert CHAIN.flatten(cold.alive).tolist() == [True, False, False, False]
+    assert float(system.force(cold).x[3]) == 0
+
+
+def test_refreezing_takes_the_present_length():
+    """What comes back has no pull and no energy; within the hysteresis, or out of reach, nothing comes back."""
+    again = js.Refreezing(hysteresis=20.0, reach=1.5)
+    _, hot = fused([400.0] * 5, refreezing=again)
+    assert not CHAIN.flatten(hot.alive).any()
+    _, cool = fused([340.0] * 5, refreezing=again, state=hot)
+    assert not CHAIN.flatten(cool.alive).any()
+    system, cold = fused([320.0] * 5, refreezing=again, state=cool)
+    assert CHAIN.flatten(cold.alive).all()
+    np.testing.assert_allclose(CHAIN.flatten(cold.rest_length), 1.3, rtol=1e-14)
+    np.testing.assert_allclose(system.force(cold).x, 0, atol=1e-13)
+    assert float(system.energy(cold).potential[0]) == pytest.approx(0, abs=1e-20)
+    _, far = fused([300.0] * 5, refreezing=js.Refreezing(20.0, reach=1.2), state=hot)
+    assert not CHAIN.flatten(far.alive).any()
+
+
+def test_broken_springs_by_where():
+    """A broken spring with an infinite stiffness pulls by nothing, not by 0 times infinity."""
+    springs = js.Springs(CHAIN, 10.0, 1.0)
+    # Constructors refuse an infinite stiffness; `tree_at` does not ask them.
+    endless = eqx.tree_at(lambda s: s.stiffness, springs, jnp.asarray([10.0, jnp.inf, 10.0, 10.0]))
+    state = dataclasses.replace(warm(CHAIN, None, 1.3), alive=CHAIN.split(jnp.asarray([True, False, True, True])))
+    np.testing.assert_allclose(endless.force(state).x, [3, -3, 3, 0, -3], atol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("make", "match"),
+    [
+        (lambda: js.ThermalStiffness(-1.0, 300.0, 400.0), "stiffness"),
+        (lambda: js.ThermalStiffness(1.0, 400.0, 400.0), "not below melting"),
+        (lambda: js.ThermalStiffness(1.0, 300.0, 400.0, 0.0), "sharpness"),
+        (lambda: js.Refreezing(-1.0, 1.0), "hysteresis"),
+        (lambda: js.Fusing(CHAIN, float("nan")), "melting"),
+        (lambda: js.Floor((0.0, 0.0), (0.0, 0.0)), "no length"),
+        (lambda: js.Floor((0.0, 0.0), (0.0, 1.0), friction=-0.1), "friction"),
+        (lambda: js.Floor((0.0, 0.0), (0.0, 1.0), restitution=1.5), "restitution"),
+        (lambda: js.System(CHAIN, 1.0, rules=js.Fusing(CHAIN, 1.0)).begin(js.State.from_points(CHAIN, CHAIN.grid())), "from_points"),
+    ],
+)
+def test_refusals(make, match):
+    """Constants without meaning, and a state without temperature, are refused with what to do."""
+    with pytest.raises(ValueError, match=match):
+        make()
+
+
+def on_floor(velocity, friction=0.0, restitution=0.0):
+    """One node 0.1 m below the floor with this velocity, after the floor."""
+    net = js.lattice(1)
+    floor = js.Floor((0.0, 0.0), (0.0, 1.0), friction, restitution)
+    state = js.State.from_points(net, [[0.0, -0.1]], [velocity])
+    return floor.update(state, state, jnp.asarray(0.1))[0]
+
+
+def test_floor():
+    """The node is on the plane; inward speed goes or comes back; friction takes mu times the normal impulse, and at most all."""
+    assert on_floor((3.0, -2.0)).points.tolist() == [[0, 0]]
+    np.testing.assert_allclose(on_floor((3.0, -2.0)).velocities, [[3, 0]])
+    np.testing.assert_allclose(on_floor((3.0, -2.0), restitution=0.5).velocities, [[3, 1]])
+    np.testing.assert_allclose(on_floor((3.0, -2.0), friction=0.4).velocities, [[3 - 0.4 * 2, 0]])
+    np.testing.assert_allclose(on_floor((3.0, -2.0), friction=4.0).velocities, [[0, 0]], atol=1e-15)
+    np.testing.assert_allclose(on_floor((3.0, 2.0), friction=4.0).velocities, [[3, 2]])

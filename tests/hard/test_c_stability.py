@@ -100,3 +100,52 @@ def test_any_step_is_finite_and_tells_when_energy_rose(stepper, log_k, log_step,
     assert not bool(status.has(Flag.NONFINITE))
     rose = np.max(np.diff(energy)) > 1e-3 * energy[0] + 1e-12 * k
     assert bool(status.has(Flag.ENERGY_ROSE)) or not rose
+
+
+def random_net(seed, kind):
+    """Twelve nodes in space: joined at random in one piece, or in two pieces with a lone node beside them."""
+    rng = np.random.default_rng(seed)
+    if kind == "one piece":
+        edges = [(i, int(rng.integers(i))) for i in range(1, 12)] + [tuple(rng.choice(12, 2, replace=False)) for _ in range(12)]
+    else:
+        edges = [(i, int(rng.integers(i))) for i in range(1, 6)] + [(i, int(rng.integers(6, i))) for i in range(7, 11)]
+        edges += [tuple(rng.choice(6, 2, replace=False)) for _ in range(8)]
+    return js.Graph.from_edges(edges, 12)
+
+
+RANDOM_NETS = {kind: random_net(7, kind) for kind in ("one piece", "two pieces and a lone node")}
+
+
+@eqx.filter_jit
+def step_energies(net, stepper, mass, k, shape, points, times):
+    """Energy before and after each of three steps of so many explicit limits [J], how they ended, and whether all is finite."""
+    system = js.System(net, mass, js.Springs(net, k, net.lengths(shape)), free=np.arange(12) > 0)
+    start = js.State.from_points(net, points)
+    dt = times * js.stable_dt(system, start)
+    run = js.rollout(system, start, stepper, dt, 3, save_every=1, observe=lambda state: system.energy(state).total)
+    return jnp.concatenate([system.energy(start).total[None], run.saved]), run.status, jnp.all(jnp.isfinite(run.state.points))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", RANDOM_NETS)
+@pytest.mark.parametrize("stepper", [js.BackwardEuler(js.CG()), js.BackwardEuler(newton=True)], ids=["linear", "Newton"])
+@settings(max_examples=40)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    log_times=st.floats(-1, 4),
+    squeeze=st.sampled_from([0.0, 0.5, 1.0, 3.0]),
+    n_coincident=st.integers(0, 3),
+)
+def test_random_nets_are_never_silent(kind, stepper, seed, log_times, squeeze, n_coincident):
+    """Stiffness over eight decades, masses over six, dt from 0.1 to 10,000 explicit limits, squeezed, stretched, coincident, in pieces: the
+    states are finite and the energy did not rise, or the status is an error.
+    """
+    rng = np.random.default_rng(seed)
+    net = RANDOM_NETS[kind]
+    k, mass = 10 ** rng.uniform(-4, 4, net.n_springs), 10 ** rng.uniform(-3, 3, 12)
+    shape = rng.standard_normal((12, 3))
+    points = squeeze * shape + 1e-3 * rng.standard_normal((12, 3))
+    points[1 : 1 + n_coincident] = points[0]
+    energy, status, is_finite = step_energies(net, stepper, *(jnp.asarray(a) for a in (mass, k, shape, points, 10**log_times)))
+    rose = np.max(np.diff(energy)) > 1e-3 * energy[0]
+    assert not bool(status.is_ok) or (bool(is_finite) and not rose)

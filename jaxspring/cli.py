@@ -124,7 +124,10 @@ def melt(arguments: MeltArguments) -> int:
     from .scenes.melting.scene import MeltSettings
 
     given = {"nodes": arguments.nodes, "duration": arguments.duration}
-    settings = MeltSettings(**{name: value for name, value in given.items() if value is not None})
+    try:
+        settings = MeltSettings(**{name: value for name, value in given.items() if value is not None})
+    except ValueError as error:
+        return complain(str(error), UNUSABLE)
     try:
         outcome = melted(settings, arguments.out, Progress("melt"))
     except (OSError, ImportError, MemoryError) as error:

@@ -150,12 +150,17 @@ def rollout(
     if is_traced(system, state, resume, job):
         return _compiled(system, state, resume, job, progress)
     result = _run_eagerly(system, state, resume, job, progress)
+    _warn(result, dt)
+    return result
+
+
+def _warn(result: Result, dt: Array) -> None:
+    """Warn of a dt and a dtype that may be at fault, at the line that called `rollout`."""
     if result.info.stable_dt is not None and bool(result.status.has(Flag.DT_LIMIT)):
         text = f"dt = {float(dt):.6g} s, but this run is surely stable only up to {float(result.info.stable_dt):.6g} s"
-        warnings.warn(f"DT_LIMIT: {EXPLANATION[Flag.DT_LIMIT]}: {text}.", StabilityWarning, stacklevel=2)
+        warnings.warn(f"DT_LIMIT: {EXPLANATION[Flag.DT_LIMIT]}: {text}.", StabilityWarning, stacklevel=3)
     if bool(result.status.has(Flag.PRECISION)):
-        warnings.warn(f"PRECISION: {EXPLANATION[Flag.PRECISION]}.", StabilityWarning, stacklevel=2)
-    return result
+        warnings.warn(f"PRECISION: {EXPLANATION[Flag.PRECISION]}.", StabilityWarning, stacklevel=3)
 
 
 class _Begun(eqx.Module):

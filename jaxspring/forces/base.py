@@ -44,6 +44,11 @@ class Rule(eqx.Module):
     Rules run in the order in which the system names them, each on the state that the one before left.
     """
 
+    @property
+    def is_contact(self) -> bool:
+        """Whether its shifts of nodes only put back what the step has carried too far: a `Ledger` books them with the step."""
+        return False
+
     def begin(self, state: State) -> State:
         """The state with the memory that this rule needs, made where it is not there yet. Called before the first step."""
         return state

@@ -65,6 +65,11 @@ class Floor(Rule):
         if is_concrete(self.restitution) and self.restitution > 1:
             raise ValueError(f"restitution = {self.restitution} throws nodes back faster than they came. Pass 0 to 1.")
 
+    @property
+    def is_contact(self) -> bool:
+        """Yes: a node is put back where the step began to carry it too far."""
+        return True
+
     def height(self, state: State) -> Array:
         """(x - p) . n of each node [m], in node shape."""
         if self.point.shape[0] != state.dim:

@@ -1,14 +1,19 @@
 """The energy ledger: what changed the energy of a scene, by name, step after step.
 
     columns   kinetic, the potential of each force, heat (with latent heat)                                [J]
-    motion    work of forces without potential, dt F . (v + v') / 2, and of the drag within others; what the columns changed besides
+    motion    work of forces without potential, dt F . (v + v'') / 2, and of the drag within others; what the columns changed besides
               is the stepper's own error, which falls with dt
-    rules     the columns after each rule minus before: heat from outside, energy that softening, fusing and contact took
+    rules     what each rule changed: a kick J of the velocity counts J . (v + v'') / 2, potentials and heat count after minus before
 
-With symplectic Euler, dt F . (v + v') / 2 summed over all forces is the change of kinetic energy exactly. All entries together are the
+v is the velocity before the step, v'' the one after motion and all rules: what a rule does to the velocity acts beside the forces of
+that step. With symplectic Euler the kicks of forces and rules sum to the change of kinetic energy exactly. All entries together are the
 change of the columns to rounding. Momentum is kept alike: what motion and each rule gave.
 
-Source: first law; the split of a kick is that of m (v'^2 - v^2) / 2 = dt F . (v + v') / 2.
+Contact puts back what the step has carried too far. That shift belongs to the step: else a node at rest on a floor, which falls g dt^2 in
+each step and is put back, would book m g^2 dt / 2 per second against the stepper, and the same for the floor. Where contact moves a node
+further than the step did, as one that starts below a floor, the shift of that step is the rule's.
+
+Source: first law; the split of kicks is that of m (v''^2 - v^2) / 2 = (dt F + J) . (v + v'') / 2.
 """
 
 from __future__ import annotations
@@ -131,21 +136,33 @@ class Ledger(Rule):
     def update(self, before: State, state: State, dt: Array) -> tuple[State, Status]:
         """Every rule, with its entry."""
         account: Account = state.ledger
-        work = account.work + self._work(before, state, dt)
-        columns, momentum = self.columns(state), self._momentum(state)
-        motion = account.motion + (columns - account.now)
-        books, impulses, status = [], [momentum - self._momentum(before)], Status.ok()
+        stages, columns, status = [before, state], [account.now, self.columns(state)], Status.ok()
         for rule in self.rules:
-            moved = state
-            state, seen = rule.update(before, state, dt)
+            last = stages[-1]
+            state, seen = rule.update(before, last, dt)
             status = status.then(seen)
-            columns_after, momentum_after = self.columns(state, moved, columns), self._momentum(state)
-            books.append(columns_after - columns)
-            impulses.append(momentum_after - momentum)
-            columns, momentum = columns_after, momentum_after
-        rules = account.rules + jnp.stack(books) if books else account.rules
-        new = Account(account.start, columns, work, motion, rules, account.impulses + jnp.stack(impulses))
+            stages.append(state)
+            columns.append(self.columns(state, last, columns[-1]))
+        mean = 0.5 * (before.velocity + state.velocity)
+        books = [self._change(a, b, mean, x, y) for a, b, x, y in zip(stages, stages[1:], columns, columns[1:], strict=False)]
+        for i, rule in enumerate(self.rules):
+            if rule.is_contact:
+                shift = jnp.where(_is_within(before, stages[1 + i], stages[2 + i]), books[1 + i], 0).at[0].set(0)
+                books[0], books[1 + i] = books[0] + shift, books[1 + i] - shift
+        momenta = jnp.stack([self._momentum(stage) for stage in stages])
+        new = Account(
+            account.start,
+            columns[-1],
+            account.work + self._work(before, mean, dt),
+            account.motion + books[0],
+            account.rules + jnp.stack(books[1:]) if self.rules else account.rules,
+            account.impulses + momenta[1:] - momenta[:-1],
+        )
         return dataclasses.replace(state, ledger=new), status
+
+    def _change(self, a: State, b: State, mean: Vector, before: Array, after: Array) -> Array:
+        """(2 + F,) what happened to the columns between two stages of a step: kicks at the mean velocity of the step [J]."""
+        return (after - before).at[0].set(jnp.sum(self._mass(a) * (b.velocity - a.velocity).dot(mean)))
 
     def columns(self, state: State, last: State | None = None, known: Array | None = None) -> Array:
         """(2 + F,) kinetic energy, potential of each force (0 where there is none), heat [J].
@@ -162,9 +179,8 @@ class Ledger(Rule):
         heat = sum((total_heat(r, state) for r in self.rules if isinstance(r, Heat)), start=zero)
         return jnp.stack([kinetic, *stored, heat])
 
-    def _work(self, before: State, after: State, dt: Array) -> Array:
-        """(F,) work of drag and of forces without potential in one step [J]."""
-        mean = 0.5 * (before.velocity + after.velocity)
+    def _work(self, before: State, mean: Vector, dt: Array) -> Array:
+        """(F,) work of drag and of forces without potential in one step at this mean velocity [J]."""
         still = before.moved(before.position, Vector.zeros_like(before.velocity))
         parts = []
         for force in self._forces():
@@ -189,6 +205,14 @@ class Ledger(Rule):
     def _mass(self, state: State) -> Array:
         self._forces()
         return jnp.asarray(self.mass, state.dtype)
+
+
+def _is_within(before: State, moved: State, put_back: State) -> Array:
+    """Whether no node was put back further than the step had carried it; the small excess is rounding of positions."""
+    shift, step = put_back.position - moved.position, moved.position - before.position
+    size = jnp.sqrt(jnp.max(before.position.dot(before.position)))
+    excess = 8 * jnp.finfo(before.dtype).eps * size
+    return jnp.all(jnp.sqrt(shift.dot(shift)) <= jnp.sqrt(step.dot(step)) + excess)
 
 
 def energy_ledger(system: Any, state: State) -> dict[str, Any]:

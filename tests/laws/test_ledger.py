@@ -58,3 +58,38 @@ def test_drag_is_the_work_of_drag():
     book = js.energy_ledger(system, run.state)
     assert book["work"]["Drag"] == pytest.approx(book["end"]["kinetic"] - 9.0, rel=1e-13)
     assert abs(book["integration"]) < 1e-13
+
+
+def resting_on_a_floor(height, dt=0.01, n_steps=100):
+    """The books of one node of 2 kg that starts this high [m] over a floor, under 10 m/s^2."""
+    net = js.lattice(1)
+    system = js.System(net, 2.0, js.Gravity((0.0, -10.0)), rules=js.Ledger(js.Floor(GROUND, UP)))
+    return js.energy_ledger(system, js.rollout(system, js.State.from_points(net, [[0.0, height]]), js.SymplecticEuler(), dt, n_steps).state)
+
+
+def test_a_node_at_rest_on_a_floor_books_nothing():
+    """It falls g dt in each step and is put back: neither the stepper nor the floor has done work."""
+    book = resting_on_a_floor(0.0)
+    assert abs(book["integration"]) < 1e-13
+    assert all(abs(value) < 1e-13 for value in book["rules"]["Floor"].values())
+    np.testing.assert_allclose(book["impulses"]["Floor"], [0, 20.0], rtol=1e-12)  # m g t
+
+
+@pytest.mark.slow
+def test_a_floor_takes_the_energy_of_the_fall():
+    """A node that falls 1 m is stopped by the floor, which takes m g h; the error of one step at impact falls with dt."""
+    errors = []
+    for dt in (4e-3, 5e-4):
+        book = resting_on_a_floor(1.0, dt, round(0.6 / dt))
+        assert book["end"]["kinetic"] == pytest.approx(0, abs=1e-12)
+        assert book["rules"]["Floor"]["kinetic"] == pytest.approx(-20.0, abs=100 * dt)
+        errors.append(abs(book["integration"]))
+        assert errors[-1] < 2 * 10 * 4.5 * dt  # m g v dt: how far gravity reaches in one step
+    assert errors[-1] < errors[0]
+
+
+def test_a_start_below_the_floor_is_lifted_by_the_floor():
+    """A shift that no step explains is the rule's: a node 1 m below is given m g h by the floor."""
+    book = resting_on_a_floor(-1.0)
+    assert book["rules"]["Floor"]["Gravity"] == pytest.approx(20.0, rel=1e-2)
+    assert abs(book["integration"]) < 1.01 * 2.0 * 10.0**2 * 0.01**2  # what it fell in the first step, m g^2 dt^2

@@ -54,6 +54,7 @@ def test_a_small_block(tmp_path, capsys):
     assert report["integration_over_exchanged"] < 0.02
     share = report["melted_fraction"]["share"]
     assert share[0] == 0
+    assert report["melted_fraction"]["time_s"][-1] == pytest.approx(0.15, rel=1e-6)  # the duration asked for, not a step less
     assert share[-1] >= 1 / 3
     assert set(report["seconds"]) >= {"run", "Springs", "Fluid", "Heat", "Fusing", "Floor"}
     assert "melted" in capsys.readouterr().out

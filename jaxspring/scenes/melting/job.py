@@ -6,6 +6,7 @@ The folder appears at the end, whole.
 from __future__ import annotations
 
 import json
+import math
 import pathlib
 import time
 from dataclasses import asdict, dataclass
@@ -71,11 +72,12 @@ class _Look(eqx.Module):
 
 
 def run_melting(scene: Melting, settings: MeltSettings, progress: Progress | None = None) -> tuple[Result, Frames]:
-    """Run the scene and keep `FRAMES` frames and the start."""
-    every = max(settings.n_steps // FRAMES, 1)
+    """Run the scene for its duration, in steps of at most its dt; keep `FRAMES` frames, or as many as there are steps, and the start."""
+    every = math.ceil(settings.n_steps / FRAMES)
     n_steps = every * min(FRAMES, settings.n_steps)
+    dt = settings.duration / n_steps  # so that equal frames fill the duration
     look = _Look(scene.net)
-    result = rollout(scene.system, scene.state, SymplecticEuler(), settings.dt, n_steps, save_every=every, observe=look, progress=progress)
+    result = rollout(scene.system, scene.state, SymplecticEuler(), dt, n_steps, save_every=every, observe=look, progress=progress)
     frames = jax.tree.map(lambda a, b: np.concatenate([np.asarray(a)[None], np.asarray(b)]), look(scene.state), result.saved)
     return result, Frames(*frames)
 

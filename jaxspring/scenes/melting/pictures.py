@@ -63,6 +63,7 @@ def _panel(axes: Any, frames: Any, i: int, settings: MeltSettings) -> Any:
     axes.set(xlim=(-half, half), ylim=(-half, half), zlim=(0, top), xlabel="x (cm)", ylabel="y (cm)", zlabel="z (cm)")
     axes.locator_params(axis="x", nbins=4)
     axes.locator_params(axis="y", nbins=4)
+    axes.zaxis.labelpad = -1
     axes.patch.set_alpha(0)  # else the next panel hides the label of z
     axes.set_box_aspect((1, 1, top / (2 * half)))
     axes.view_init(elev=14, azim=-60)

@@ -124,7 +124,7 @@ def main() -> None:
     """Measure, print, write the table and the picture."""
     quick = arguments(__doc__).quick
     rounds = 3 if quick else 9
-    lattice_rows = lattices([(32, 1000)] if quick else [(32, 1000), (128, 1000), (512, 1000)], rounds)
+    lattice_rows = lattices([(32, 1000)] if quick else [(32, 1000), (128, 1000), (512, 4000)], rounds)
     graph_rows = graphs([(1000, 200)] if quick else [(1000, 1000), (10_000, 300), (100_000, 200)], rounds)
     show("lattices", lattice_rows)
     show("graphs", graph_rows)

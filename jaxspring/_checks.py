@@ -124,3 +124,20 @@ def _first(bad: np.ndarray, numbers: np.ndarray) -> tuple[str, str]:
     index = tuple(int(i) for i in np.argwhere(bad)[0])
     where = "" if not index else "[" + ", ".join(map(str, index)) + "]"
     return where, str(numbers[index])
+
+
+def plane(point: Any, normal: Any) -> tuple[Array, Array]:
+    """(D,) a point of a plane [m] and its unit normal, from a normal of any length.
+
+    Raises:
+        ValueError: shapes that are not (D,) or differ, what is not finite, a normal without length.
+    """
+    point, normal = as_inexact("point", point), as_inexact("normal", normal)
+    for name, value in (("point", point), ("normal", normal)):
+        finite(name, value)
+        if value.ndim != 1 or value.shape[0] not in (1, 2, 3) or value.shape != point.shape:
+            raise ValueError(f"{name} has shape {value.shape}; expected (D,), one number per coordinate, e.g. (0, 0, 1).")
+    length = jnp.sqrt(jnp.sum(normal**2))
+    if is_concrete(length) and not length > 0:
+        raise ValueError("normal has no length, so the plane no direction. Pass e.g. normal=(0, 0, 1).")
+    return point, normal / length

@@ -14,7 +14,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._checks import as_inexact, finite, has_shape, is_concrete, nonnegative
+from .._checks import as_inexact, has_shape, is_concrete, nonnegative, plane
 from ..numerics import tiny
 from ..state import State
 from ..status import Flag, Status
@@ -48,16 +48,7 @@ class Floor(Rule):
     restitution: Array
 
     def __init__(self, point: Any, normal: Any, friction: Any = 0.0, restitution: Any = 0.0):
-        self.point = as_inexact("point", point)
-        normal = as_inexact("normal", normal)
-        for name, value in (("point", self.point), ("normal", normal)):
-            finite(name, value)
-            if value.ndim != 1 or value.shape[0] not in (1, 2, 3) or value.shape != self.point.shape:
-                raise ValueError(f"{name} has shape {value.shape}; expected (D,), one number per coordinate, e.g. (0, 0, 1).")
-        length = jnp.sqrt(jnp.sum(normal**2))
-        if is_concrete(length) and not length > 0:
-            raise ValueError("normal has no length, so the plane no direction. Pass e.g. normal=(0, 0, 1).")
-        self.normal = normal / length
+        self.point, self.normal = plane(point, normal)
         self.friction, self.restitution = as_inexact("friction", friction), as_inexact("restitution", restitution)
         for name, value in (("friction", self.friction), ("restitution", self.restitution)):
             has_shape(name, value, {"one number": ()})

@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._checks import as_inexact, finite, is_concrete, nonnegative
+from .._checks import as_inexact, finite, nonnegative, plane
 from ..forces.base import any_refused
 from ..state import State
 from .boundaries import Given, ThermalBoundary, at_time
@@ -59,16 +59,7 @@ class HotPlane(ThermalBoundary):
         reach: [m].
         fade: [m].
         """
-        self.point = as_inexact("point", point)
-        normal = as_inexact("normal", normal)
-        for name, value in (("point", self.point), ("normal", normal)):
-            finite(name, value)
-            if value.ndim != 1 or value.shape[0] not in (1, 2, 3) or value.shape != self.point.shape:
-                raise ValueError(f"{name} has shape {value.shape}; expected (D,), one number per coordinate, e.g. (0, 0, 1).")
-        length = jnp.sqrt(jnp.sum(normal**2))
-        if is_concrete(length) and not length > 0:
-            raise ValueError("normal has no length, so the plane no direction. Pass e.g. normal=(0, 0, 1).")
-        self.normal = normal / length
+        self.point, self.normal = plane(point, normal)
         self.temperature = temperature if callable(temperature) else as_inexact("temperature", temperature)
         self.coefficient = as_inexact("coefficient", coefficient)
         self.area = as_inexact("area", area)

@@ -184,6 +184,8 @@ def _begin(system: System, state: State, resume: Resume, job: _Job) -> _Begun:
     limit = dt_limit(still, still_start, job.stepper)
     memory = job.stepper.init(ready, start) if isinstance(resume.memory, _Unset) else resume.memory
     status = begin(system, ready, Carry(start, memory, resume.step), job.dt, limit)
+    if not job.stepper.runs_backward:
+        status = status.then(Status.when(Flag.INVALID, stopped(job.dt) < 0, step=resume.step))
     return _Begun(ready, start, Resume(resume.start_time, resume.step, memory), limit, status)
 
 

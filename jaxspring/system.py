@@ -125,15 +125,19 @@ class System(eqx.Module):
         return effect
 
     @property
+    def parts(self) -> tuple[Rule, ...]:
+        """Forces, then rules: in the order of their indices in a status."""
+        return (*self.forces, *(self.rules or ()))
+
+    @property
     def effects(self) -> tuple[str, ...]:
         """Names of forces and rules, in the order of their indices in a status."""
-        return tuple(type(effect).__name__ for effect in (*self.forces, *(self.rules or ())))
+        return tuple(type(part).__name__ for part in self.parts)
 
     @property
     def followers(self) -> tuple[tuple[int, Rule], ...]:
         """Whatever acts after a step, with its index in a status: forces that keep a memory, then the rules."""
-        n = len(self.forces)
-        return (*((i, f) for i, f in enumerate(self.forces) if f.is_rule), *((n + i, r) for i, r in enumerate(self.rules or ())))
+        return tuple((i, part) for i, part in enumerate(self.parts) if not isinstance(part, Force) or part.is_rule)
 
     def begin(self, state: State) -> State:
         """The constrained state with the memory that forces and rules need."""

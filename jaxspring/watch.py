@@ -76,7 +76,7 @@ def begin(system: System, ready: System, carry: Carry, dt: Array, limit: Array |
     # Masses first: gravity holds them too, and would be blamed.
     status = Status.when(Flag.INVALID, ~jnp.all(system.mass > 0), step=carry.step)
     status = status.then(Status.when(Flag.NONFINITE, _has_nonfinite(system.mass), step=carry.step))
-    for i, effect in enumerate((*system.forces, *(system.rules or ()))):
+    for i, effect in enumerate(system.parts):
         bad = effect.invalid()
         if bad is not None:
             status = status.then(Status.when(Flag.INVALID, bad, step=carry.step, effect=i))
@@ -105,7 +105,7 @@ def look(system: System, carry: Carry) -> Status:
     bad = _nonfinite(state)
     node = jnp.argmax(jnp.ravel(bad))
     status = Status.when(Flag.NONFINITE, jnp.any(bad), step=carry.step, node=node, count=jnp.sum(bad))
-    for i, effect in enumerate((*system.forces, *(system.rules or ()))):
+    for i, effect in enumerate(system.parts):
         for found in effect.diagnose(state):
             raised = Status.when(found.flag, found.count > 0, step=carry.step, node=found.node, effect=i, count=found.count)
             status = status.then(raised)

@@ -131,8 +131,7 @@ class ImplicitStepper(Stepper):
         """One stage, and the state after it; with dt = 0, which no matrix survives, the state itself."""
         stands = dt == 0
         new, after = self._step(system, state, jnp.where(stands, jnp.ones_like(dt), dt), memory)
-        status = Status.when(Flag.INVALID, dt < 0).then(after.info.status.only_if(~stands))
-        after = eqx.tree_at(lambda m: m.info.status, after, status)
+        after = eqx.tree_at(lambda m: m.info.status, after, after.info.status.only_if(~stands))
         return jax.tree.map(lambda old, moved: jnp.where(stands, old, moved), state, new), after
 
     def _step(self, system: System, state: State, dt: Array, memory: Memory) -> tuple[State, Memory]:

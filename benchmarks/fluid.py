@@ -4,9 +4,10 @@
 
 Lennard-Jones, its force shifted to zero at 2.5 sigma, skin 0.3, liquid density 0.8, float32, 1e3 to 1e5 particles in open space. Beside it,
 where they are installed: jax-md, Warp's hash grid, a list in numba. Read: `M` is million pairs within the cut-off a second, each counted
-once, the median of interleaved rounds; `error` is the largest difference from the float64 sum over all pairs, over the largest force.
-In full steps (velocity Verlet, speeds of temperature 1) the list is remade when it must be; `rebuilds` says how often, `build`
-how many forces one costs.
+once, the median of interleaved rounds, each a burst of at least 20 ms; `error` is the largest difference from the float64 sum over all
+pairs, over the largest force. `gradient` is that of the squared forces by the positions, in forces.
+In full steps (100 of velocity Verlet, speeds of temperature 1) the list is remade when it must be, Warp's grid in each; `apart` is how far
+the points end from ours, in sigma; the pairs are those at the start. Draws rates and steps.
 """
 
 from __future__ import annotations
@@ -24,10 +25,12 @@ import jaxspring as js
 from jaxspring.progress import Stopwatch
 
 from . import fluid_peers
-from .measure import arguments, show, write
+from .measure import RESULTS, Panel, arguments, draw, show, write
 
 REACH, SKIN, DENSITY, CAPACITY = 2.5, 0.3, 0.8, 96
-DT, N_STEPS = 2e-3, 50
+DT, N_STEPS = 2e-3, 100
+BURST_S = 0.02
+STYLES = {"jaxspring": "o-", "jax_md": "s--", "warp": "^--", "numba": "x:"}
 
 
 def liquid(n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -51,7 +54,7 @@ def exact(points: np.ndarray) -> tuple[np.ndarray, int]:
     return forces, len(i)
 
 
-def ours(points: np.ndarray, speeds: np.ndarray) -> tuple[js.System, js.State]:
+def begun(points: np.ndarray, speeds: np.ndarray) -> tuple[js.System, js.State]:
     """The same fluid here, its list begun."""
     net = js.Graph.from_edges(np.zeros((0, 2), int), len(points))
     fluid = js.Fluid(js.LennardJones(1.0, 1.0), js.ShiftedForce(REACH), js.NeighbourList(CAPACITY, SKIN))
@@ -59,67 +62,109 @@ def ours(points: np.ndarray, speeds: np.ndarray) -> tuple[js.System, js.State]:
     return system, eqx.filter_jit(lambda s: system.begin(s))(js.State.from_points(net, points, speeds))
 
 
+def ours(points: np.ndarray, speeds: np.ndarray) -> fluid_peers.Peer:
+    """Our own fluid, asked as the others are."""
+    system, state = begun(points, speeds)
+    force = jax.jit(lambda s: system.force(s))
+
+    def steps(dt: float, n_steps: int) -> Callable[[], tuple[Any, int]]:
+        def run() -> tuple[Any, int]:
+            end = jax.block_until_ready(js.rollout(system, state, js.VelocityVerlet(), dt, n_steps))
+            js.raise_for_status(end)
+            return end.state.points, int(end.state.neighbours.rebuilds)
+
+        return run
+
+    def forces() -> np.ndarray:
+        return np.stack([np.asarray(state.layout.flatten(a)) for a in force(state)], axis=-1)
+
+    return fluid_peers.Peer(lambda: force(state).components, forces, steps)
+
+
+def costs(points: np.ndarray, speeds: np.ndarray, rounds: int) -> dict[str, float]:
+    """What a new list and a gradient cost, in forces of the same rounds."""
+    system, state = begun(points, speeds)
+
+    def squared_forces(x: js.Vector) -> jax.Array:
+        return sum(jnp.sum(a * a) for a in system.force(state.moved(x, state.velocity)))
+
+    force, gradient = jax.jit(lambda s: system.force(s)), jax.jit(lambda s: jax.grad(squared_forces)(s.position))
+    begin = jax.jit(lambda s: system.begin(eqx.tree_at(lambda s: s.neighbours, s, None)))
+    runs = {"force": lambda: force(state), "list": lambda: begin(state), "gradient": lambda: gradient(state)}
+    taken = seconds(runs, rounds)
+    return {name: taken[name] / taken["force"] for name in ("list", "gradient")}
+
+
 def seconds(runs: dict[str, Callable[[], Any]], rounds: int) -> dict[str, float]:
-    """Median time of each, in interleaved rounds."""
-    for run in runs.values():
-        jax.block_until_ready(run())
+    """Median time of each, in interleaved rounds of bursts: a simulation asks again at once."""
     times: dict[str, list[float]] = {name: [] for name in runs}
+    counts = {}
+    for name, run in runs.items():
+        jax.block_until_ready(run())
+        clock = Stopwatch()
+        jax.block_until_ready(run())
+        counts[name] = max(1, round(BURST_S / max(clock.seconds, 1e-9)))
     for _ in range(rounds):
         for name, run in runs.items():
             clock = Stopwatch()
-            jax.block_until_ready(run())
-            times[name].append(clock.seconds)
+            for _ in range(counts[name]):
+                jax.block_until_ready(run())
+            times[name].append(clock.seconds / counts[name])
     return {name: statistics.median(taken) for name, taken in times.items()}
 
 
-def one_size(n: int, rounds: int) -> tuple[list[dict], dict]:
-    """Rows of forces with a list that is ready, and the row of full steps."""
+def one_size(n: int, rounds: int) -> tuple[list[dict], list[dict], dict]:
+    """Rows of forces with a list that is ready, rows of full steps, and what a list and a gradient cost."""
     points, speeds = liquid(n)
     reference, n_pairs = exact(points)
-    system, state = ours(points, speeds)
-    force = eqx.filter_jit(lambda s: system.force(s))
-    begin = eqx.filter_jit(lambda s: system.begin(eqx.tree_at(lambda s: s.neighbours, s, None)))
-    runs = {"jaxspring": lambda: force(state).components, "build": lambda: begin(state).position.x}
-    results = {"jaxspring": lambda: np.stack([np.asarray(state.layout.flatten(a)) for a in force(state)], axis=-1)}
-    for name in ("jax_md", "warp", "numba"):
-        peer = getattr(fluid_peers, name)(points, REACH, SKIN)
-        if peer is not None:
-            runs[name], results[name] = peer
-    taken = seconds(runs, rounds)
-    rows = []
-    for name, result in results.items():
-        error = float(np.abs(result() - reference).max() / np.abs(reference).max())
-        rows.append({"n": n, "program": name, "ms": taken[name] * 1e3, "M": n_pairs / taken[name] / 1e6, "error": error})
+    peers = {name: getattr(fluid_peers, name)(points, speeds, REACH, SKIN) for name in ("jax_md", "warp", "numba")}
+    programs = {"jaxspring": ours(points, speeds), **{name: peer for name, peer in peers.items() if peer is not None}}
+    taken = seconds({name: peer.force for name, peer in programs.items()}, rounds)
+    forces = []
+    for name, peer in programs.items():
+        error = float(np.abs(peer.forces() - reference).max() / np.abs(reference).max())
+        forces.append({"n": n, "program": name, "ms": taken[name] * 1e3, "M": n_pairs / taken[name] / 1e6, "error": error})
 
-    def steps() -> js.Result:
-        return js.rollout(system, state, js.VelocityVerlet(), DT, N_STEPS)
-
-    end = steps()
-    each = seconds({"steps": lambda: steps().state.position.x}, max(rounds // 3, 3))["steps"] / N_STEPS
-    full = {
-        "n": n,
-        "ms": each * 1e3,
-        "M": n_pairs / each / 1e6,
-        "rebuilds": int(end.state.neighbours.rebuilds),
-        "steps": N_STEPS,
-        "build": taken["build"] / taken["jaxspring"],
-        "status": end.status.describe(),
-    }
-    return rows, full
+    runs = {name: peer.steps(DT, N_STEPS) for name, peer in programs.items()}
+    ends = {name: run() for name, run in runs.items()}
+    taken = seconds(runs, max(rounds // 3, 3))
+    steps = []
+    for name, (end, rebuilds) in ends.items():
+        each = taken[name] / N_STEPS
+        apart = float(np.abs(end - ends["jaxspring"][0]).max())
+        steps.append({"n": n, "program": name, "ms": each * 1e3, "M": n_pairs / each / 1e6, "rebuilds": rebuilds, "apart": apart})
+    return forces, steps, {"n": n, **costs(points, speeds, rounds)}
 
 
 def main() -> None:
     options = arguments(__doc__)
     sizes, rounds = ([1_000, 10_000], 5) if options.quick else ([1_000, 10_000, 100_000], 9)
-    forces, steps = [], []
+    forces, steps, others = [], [], []
     for n in sizes:
-        rows, full = one_size(n, rounds)
-        forces += rows
-        steps.append(full)
+        of_forces, of_steps, of_others = one_size(n, rounds)
+        forces += of_forces
+        steps += of_steps
+        others.append(of_others)
     show("forces, the list ready", forces)
-    show("full steps, the list remade when it must be", steps)
+    show(f"full steps, the list remade when it must be ({N_STEPS} steps)", steps)
+    show("a new list, and a gradient, in forces", others)
     settings = {"reach": REACH, "skin": SKIN, "density": DENSITY, "capacity": CAPACITY, "dt": DT}
-    write("fluid", settings, {"forces": forces, "steps": steps})
+    write("fluid", settings, {"forces": forces, "steps": steps, "others": others})
+    panels = [
+        Panel(title, "million pairs a second", curves(rows), log=True)
+        for title, rows in (("forces, the list ready", forces), ("full steps, lists remade", steps))
+    ]
+    draw(panels, RESULTS / "fluid.png")
+
+
+def curves(rows: list[dict]) -> dict[tuple[str, str], tuple[list[float], list[float]]]:
+    """Rate over the number of particles, one curve for each program."""
+    found = {}
+    for name, style in STYLES.items():
+        of_name = [row for row in rows if row["program"] == name]
+        if of_name:
+            found[name.replace("_", "-"), style] = ([row["n"] for row in of_name], [row["M"] for row in of_name])
+    return found
 
 
 if __name__ == "__main__":

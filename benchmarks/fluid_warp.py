@@ -1,5 +1,6 @@
 """The fluid by Warp's hash grid. A file of its own: Warp reads a kernel's source and its annotations."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -22,24 +23,60 @@ def lennard_jones(grid: wp.uint64, at: wp.array(dtype=wp.vec3), reach: float, en
     out[i] = total
 
 
-def make(wp: Any, points: np.ndarray, reach: float) -> Any:
-    """Forces with a grid that is ready, and the forces themselves."""
-    from .fluid_peers import end_force
+@wp.kernel
+def drift(at: wp.array(dtype=wp.vec3), speed: wp.array(dtype=wp.vec3), force: wp.array(dtype=wp.vec3), dt: float):
+    """First half of a step of velocity Verlet: half a kick and a drift."""
+    i = wp.tid()
+    speed[i] = speed[i] + 0.5 * dt * force[i]
+    at[i] = at[i] + dt * speed[i]
+
+
+@wp.kernel
+def kick(speed: wp.array(dtype=wp.vec3), force: wp.array(dtype=wp.vec3), dt: float):
+    """Second half of a step: half a kick."""
+    i = wp.tid()
+    speed[i] = speed[i] + 0.5 * dt * force[i]
+
+
+def make(wp: Any, points: np.ndarray, speeds: np.ndarray, reach: float) -> Any:
+    """Forces with a grid that is ready, the forces themselves, and full steps."""
+    from .fluid_peers import Peer, end_force
 
     wp.config.quiet = True
     wp.init()
     n = len(points)
-    at = wp.array(points.astype(np.float32), dtype=wp.vec3, device="cpu")
+    start_at, start_speed = (wp.array(a.astype(np.float32), dtype=wp.vec3, device="cpu") for a in (points, speeds))
     out = wp.zeros(n, dtype=wp.vec3, device="cpu")
     cells = max(8, min(128, int(np.ptp(points, axis=0).max() / reach) + 2))
-    grid = wp.HashGrid(cells, cells, cells, device="cpu")
-    grid.build(at, reach)
 
-    def run() -> None:
+    def new_grid() -> Any:
+        grid = wp.HashGrid(cells, cells, cells, device="cpu")
+        grid.build(start_at, reach)
+        return grid
+
+    ready = new_grid()
+
+    def fill(grid: Any, at: Any, out: Any) -> None:
         wp.launch(lennard_jones, dim=n, inputs=[grid.id, at, reach, end_force(reach), out], device="cpu")
 
     def forces() -> np.ndarray:
-        run()
+        fill(ready, start_at, out)
         return out.numpy()
 
-    return run, forces
+    def steps(dt: float, n_steps: int) -> Callable[[], tuple[Any, int]]:
+        grid = new_grid()
+
+        def run() -> tuple[Any, int]:
+            at, speed, force = wp.clone(start_at), wp.clone(start_speed), wp.zeros(n, dtype=wp.vec3, device="cpu")
+            grid.build(at, reach)
+            fill(grid, at, force)
+            for _ in range(n_steps):
+                wp.launch(drift, dim=n, inputs=[at, speed, force, dt], device="cpu")
+                grid.build(at, reach)
+                fill(grid, at, force)
+                wp.launch(kick, dim=n, inputs=[speed, force, dt], device="cpu")
+            return at.numpy(), n_steps
+
+        return run
+
+    return Peer(lambda: fill(ready, start_at, out), forces, steps)

@@ -3,7 +3,7 @@
     cell          floor(x / edge) modulo the grid, one number per particle: the grid wraps, so that space needs no bounds
     candidates    for each cell, the particles of the 3**D cells around it, one after the other (Q, cells)
     bits          for each particle, which candidates are nearer than the edge, 32 to a word (Q/32, N)
-    table         the candidates whose bits are set, one bit of every particle at a time (K, N); empty places hold the particle itself
+    table         the candidates whose bits are set, one bit of every particle at a time (K, N); empty places hold N
 
 The bits make the table without a scatter or a sort of N Q entries. A cell far away that the wrap puts at the same number only adds
 candidates; distances decide.
@@ -34,7 +34,7 @@ class Neighbourhood(eqx.Module):
     Attributes:
         order: (N,) particle at each place, sorted by cell.
         place: (N,) place of each particle: the inverse of `order`.
-        table: (K, N) places of the neighbours of the particle at each place; its own place where there is none.
+        table: (K, N) places of the neighbours of the particle at each place; N where there is none.
         needed: capacity that holds all neighbours and candidates.
     """
 
@@ -70,8 +70,12 @@ def _sorted_cells(position: Fields, edge: Array, per_axis: int) -> tuple[Array, 
         # The remainder is taken before the conversion: coordinates may be larger than an int32.
         along = jnp.mod(jnp.floor(a / edge), per_axis).astype(jnp.int32)
         cell = cell * per_axis + jnp.clip(along, 0, per_axis - 1)
-    numbers = jnp.arange(cell.shape[0], dtype=jnp.int32)
-    cells, order = lax.sort((cell, numbers), num_keys=1)
+    n = cell.shape[0]
+    if per_axis ** len(position) * n < 2**32:
+        # Cell and particle in one number: one array is sorted four times as fast as two.
+        both = lax.sort(cell.astype(jnp.uint32) * np.uint32(n) + jnp.arange(n, dtype=jnp.uint32))
+        return (both // np.uint32(n)).astype(jnp.int32), (both % np.uint32(n)).astype(jnp.int32)
+    cells, order = lax.sort((cell, jnp.arange(n, dtype=jnp.int32)), num_keys=1)
     return cells, order
 
 
@@ -79,14 +83,15 @@ def _candidates(cells: Array, per_axis: int, dim: int, room: int) -> tuple[Array
     """(room, cells) places of the particles in the cells around each cell, N where there is none; and the largest number of them."""
     n_cells = per_axis**dim
     start = jnp.searchsorted(cells, jnp.arange(n_cells + 1, dtype=jnp.int32)).astype(jnp.int32)
-    around = jnp.asarray(_cells_around(per_axis, dim))
-    first, count = start[around], (start[1:] - start[:-1])[around]
+    first_cell, last_cell = _runs_around(per_axis, dim)
+    first = start[first_cell]
+    count = start[last_cell] - first
     end = jnp.cumsum(count, axis=0, dtype=jnp.int32)
     # Slot q lies in the range of which the ends of all earlier ones are at most q: its place is q plus that range's shift.
     shift = first - (end - count)
     slot = jnp.arange(room, dtype=jnp.int32)[:, None]
     place = slot + shift[0][None]
-    for i in range(1, around.shape[0]):
+    for i in range(1, first.shape[0]):
         place = jnp.where(slot >= end[i - 1][None], slot + shift[i][None], place)
     n = jnp.asarray(cells.shape[0], jnp.int32)
     return jnp.where(slot < end[-1][None], place, n), jnp.max(end[-1])
@@ -144,7 +149,7 @@ def _table(bits: Array, cells: Array, candidates: Array, capacity: int) -> tuple
         lowest = word & (~word + 1)
         bit = lax.population_count(lowest - 1).astype(jnp.int32)
         slot = (jnp.minimum(place, n_words - 1) * WORD + jnp.minimum(bit, WORD - 1)) * candidates.shape[1] + cells
-        found = jnp.where(word != 0, take(candidates.ravel(), slot), numbers)
+        found = jnp.where(word != 0, take(candidates.ravel(), slot), jnp.asarray(n, jnp.int32))
         rest = word ^ lowest
         is_done = (rest == 0) & (place < n_words)
         place = jnp.where(is_done, take(following, jnp.minimum(place + 1, n_words) * n + numbers), place)
@@ -154,9 +159,20 @@ def _table(bits: Array, cells: Array, candidates: Array, capacity: int) -> tuple
     return lax.scan(next_bit, start, None, length=capacity)[1], count
 
 
-def _cells_around(per_axis: int, dim: int) -> np.ndarray:
-    """(3**D, cells) numbers of the cells around each cell, itself included, the grid wrapping."""
+def _runs_around(per_axis: int, dim: int) -> tuple[np.ndarray, np.ndarray]:
+    """(2 x 3**(D-1), cells) first number and last plus one of runs of cells with which the 3**D cells around each are numbered.
+
+    Three neighbours along the last axis follow each other, but for one that the wrap puts at the other end: it is a run of its own.
+    """
     where = np.stack(np.unravel_index(np.arange(per_axis**dim), (per_axis,) * dim))
-    offsets = np.array(list(itertools.product((-1, 0, 1), repeat=dim)))
-    moved = (where[None] + offsets[:, :, None]) % per_axis
-    return np.stack([np.ravel_multi_index(tuple(m), (per_axis,) * dim) for m in moved]).astype(np.int32)
+    along = where[-1]
+    wrapped = np.where(along == 0, per_axis - 1, 0)
+    has_wrapped = (along == 0) | (along == per_axis - 1)
+    first, last = [], []
+    for offset in itertools.product((-1, 0, 1), repeat=dim - 1):
+        row = np.zeros_like(along)
+        for coordinate, step in zip(where[:-1], offset, strict=True):
+            row = row * per_axis + (coordinate + step) % per_axis
+        first += [row * per_axis + np.maximum(along - 1, 0), row * per_axis + wrapped]
+        last += [row * per_axis + np.minimum(along + 1, per_axis - 1) + 1, row * per_axis + wrapped + has_wrapped]
+    return np.stack(first).astype(np.int32), np.stack(last).astype(np.int32)

@@ -112,11 +112,11 @@ class Fluid(Force):
 
     def force(self, state: State) -> Vector:
         """Force on each node [N]."""
-        return Vector(self._sum(state, lambda terms: terms.force, state.dim, self.drag is not None))
+        return Vector(self._sum(state, PairTerms.force, state.dim, self.drag is not None))
 
     def energy(self, state: State) -> Array:
         """Sum of the pairs' potentials [J]; below zero, without bound for many particles, where the law attracts at every distance."""
-        return jnp.sum(self._sum(state, lambda terms: terms.energy, 1)[0])
+        return jnp.sum(self._sum(state, PairTerms.energy, 1)[0])
 
     def can_feed(self, state: State) -> bool:
         """No: the pairs have a potential, and drag takes energy out."""
@@ -128,15 +128,15 @@ class Fluid(Force):
 
     def stiffness_bound(self, state: State) -> Array:
         """Twice the sum of the pairs' stiffnesses at each node [N/m], where they are now: pairs that come closer are stiffer."""
-        return self._sum(state, lambda terms: terms.stiffness, 1)[0]
+        return self._sum(state, PairTerms.stiffness, 1)[0]
 
     def damping_bound(self, state: State) -> Array | None:
         """Twice the sum of the pairs' drag coefficients at each node [N s/m]; None without drag."""
-        return None if self.drag is None else self._sum(state, lambda terms: terms.damping, 1)[0]
+        return None if self.drag is None else self._sum(state, PairTerms.damping, 1)[0]
 
     def diagnose(self, state: State) -> tuple[Finding, ...]:
         """OVERLAP: pairs closer than the core, with the first node of one; NEIGHBOUR_OVERFLOW with the capacity that is needed."""
-        count = self._sum(state, lambda terms: terms.overlap, 1)[0]
+        count = self._sum(state, PairTerms.overlap, 1)[0]
         pairs = jnp.round(jnp.sum(count) / 2).astype(jnp.int32)
         findings = (Finding(Flag.OVERLAP, pairs, jnp.argmax(jnp.ravel(count) > 0).astype(jnp.int32)),)
         needed = self.pairs.needed(state.neighbours)
@@ -186,7 +186,7 @@ class Fluid(Force):
             if is_concrete(value) and is_concrete(reach) and bool(value > reach.astype(value.dtype)):
                 raise ValueError(f"{name} = {value} m is beyond the cut-off, {reach} m. Unchecked, pairs between the two would be dropped.")
 
-    def _sum(self, state: State, term: Callable[[PairTerms], Any], n: int, with_velocity: bool = False) -> Fields:
+    def _sum(self, state: State, term: Callable[..., Fields], n: int, with_velocity: bool = False) -> Fields:
         """Sum of a pair term at each node, `n` arrays in node shape; zeros while nothing is fluid."""
         shape = state.position.shape
         fluid = None if self.molten is None else self.molten.is_fluid(state)
@@ -202,12 +202,12 @@ class Fluid(Force):
 
         def summed(operands: tuple[Particles, PairTerms, Any]) -> Fields:
             particles, terms, memory = operands
-            return self.pairs.sum(term(terms), particles.fields(), memory)
+            return self.pairs.sum(term, terms, particles.fields(), memory, sign=-1 if term is PairTerms.force else 1)
 
         def nothing(operands: tuple[Particles, PairTerms, Any]) -> Fields:
             return (jnp.zeros(particles.position[0].shape, state.dtype),) * n
 
-        terms = PairTerms(self.law, self.cutoff, self.core, self.drag, particles)
+        terms = PairTerms(self.law, self.cutoff, self.core, self.drag, particles.arrangement)
         operands = (particles, terms, memory)
         flat = summed(operands) if fluid is None else lax.cond(any_lane(jnp.any(fluid)), summed, nothing, operands)
         return tuple(a.reshape(shape) for a in flat)

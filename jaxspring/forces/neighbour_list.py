@@ -17,6 +17,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array
 
@@ -29,7 +30,7 @@ from .pairs import AllPairs, PairFunction, Pairs
 Fields = tuple[Array, ...]
 
 # Neighbours taken at a time: fewer write the sums more often, more compile longer.
-SLOTS = 8
+SLOTS = 4
 
 
 class NeighbourMemory(eqx.Module):
@@ -90,12 +91,12 @@ class NeighbourList(Pairs):
         """Capacity needed where the list is too small, else 0."""
         return jnp.where(memory.near.needed > self.capacity, memory.near.needed, 0)
 
-    def sum(self, function: PairFunction, fields: Fields, memory: NeighbourMemory) -> Fields:
+    def visit(self, function: PairFunction, fields: Fields, memory: NeighbourMemory) -> Fields:
         """Sum over the listed pairs; over all pairs where the list is too small."""
         return lax.cond(
             any_lane(memory.near.needed > self.capacity),
-            lambda fields, near: AllPairs().sum(function, fields),
-            lambda fields, near: _sum_listed(function, fields, near),
+            lambda fields, near: AllPairs().visit(function, fields),
+            lambda fields, near: _sum_listed(function, fields, near, len(memory.reference)),
             fields,
             memory.near,
         )
@@ -107,26 +108,44 @@ class NeighbourList(Pairs):
         return find_neighbours(position, reach.astype(dtype) + self.skin.astype(dtype), self.capacity)
 
 
-def _sum_listed(function: PairFunction, fields: Fields, near: Neighbourhood) -> Fields:
-    """Sum over the table's rows, all particles at a time, in the order of their cells, so that neighbours are near in memory."""
+def _sum_listed(function: PairFunction, fields: Fields, near: Neighbourhood, dim: int) -> Fields:
+    """Sum over the table, some rows of all particles at a time, in the order of their cells, so that neighbours are near in memory."""
     own = tuple(a[near.order] for a in fields)
     n = own[0].shape[0]
-    numbers = jnp.arange(n, dtype=jnp.int32)
+    everyone = _packed(own, dim)
 
-    def of_row(row: Array) -> Fields:
-        return function(own, tuple(a.at[row].get(mode="promise_in_bounds") for a in own), row != numbers)
+    def of_rows(places: Array) -> Fields:
+        # All fields of a particle are read at once and used apart: both loops vectorise.
+        found = everyone.at[places].get(mode="promise_in_bounds", wrap_negative_indices=False)
+        return function(tuple(a[None] for a in own), tuple(found[..., i] for i in range(len(own))), None)
 
     # Rematerialised, so that a gradient keeps no pair.
     @jax.checkpoint
-    def add_rows(total: Fields, rows: Array) -> tuple[Fields, None]:
+    def add_rows(total: Fields, places: Array) -> tuple[Fields, None]:
+        values = of_rows(places)
         for i in range(SLOTS):
-            total = tuple(t + value for t, value in zip(total, of_row(rows[i]), strict=True))
+            total = tuple(t + value[i] for t, value in zip(total, values, strict=True))
         return total, None
 
-    shapes = jax.eval_shape(of_row, numbers)
-    start = tuple(jnp.zeros(s.shape, s.dtype) for s in shapes)
-    total, _ = lax.scan(add_rows, start, near.table.reshape(-1, SLOTS, n))
+    tables = near.table.reshape(-1, SLOTS, n)
+    shapes = jax.eval_shape(of_rows, tables[0])
+    start = tuple(jnp.zeros(n, s.dtype) for s in shapes)
+    total, _ = lax.scan(add_rows, start, tables)
     return tuple(a[near.place] for a in total)
+
+
+def _packed(fields: Fields, dim: int) -> Array:
+    """(N + 1, F) all fields of a particle side by side, filled up to a power of two; the last one is far from everything.
+
+    Empty places of the table point to it. The law's cut-off makes its pairs zero: no mask is needed.
+    """
+    n, dtype = fields[0].shape[0], fields[0].dtype
+    width = 1 << (len(fields) - 1).bit_length()
+    nothing = jnp.zeros(n, dtype)
+    near = jnp.stack([*fields, *[nothing] * (width - len(fields))], axis=1)
+    # Its square, and the sum of three, are still finite.
+    far = np.sqrt(np.finfo(dtype).max) / 16
+    return jnp.concatenate([near, jnp.asarray([far] * dim + [0] * (width - dim), dtype)[None]])
 
 
 def _farthest(a: Fields, b: Fields) -> Array:

@@ -24,6 +24,27 @@ from .pair_laws import PairLaw
 Fields = tuple[Array, ...]
 
 
+class Arrangement(eqx.Module):
+    """Which fields the particles have, and in which order they stand.
+
+    Attributes:
+        dim: coordinates (static).
+        has_charge: whether a charge multiplies the law (static).
+        has_fluid: whether some may be solid (static).
+    """
+
+    dim: int = eqx.field(static=True)
+    has_charge: bool = eqx.field(static=True)
+    has_fluid: bool = eqx.field(static=True)
+
+    def particles(self, fields: Fields) -> Particles:
+        """The fields by their names."""
+        rest = iter(fields[self.dim :])
+        charge = next(rest) if self.has_charge else None
+        fluid = next(rest) if self.has_fluid else None
+        return Particles(fields[: self.dim], charge, fluid, tuple(rest))
+
+
 class Particles(eqx.Module):
     """Node fields of the particles, flat, as the pair terms read them.
 
@@ -44,12 +65,10 @@ class Particles(eqx.Module):
         extra = tuple(a for a in (self.charge, self.fluid) if a is not None)
         return (*self.position, *extra, *self.velocity)
 
-    def like(self, fields: Fields) -> Particles:
-        """The same arrangement of other arrays."""
-        dim, rest = len(self.position), iter(fields[len(self.position) :])
-        charge = None if self.charge is None else next(rest)
-        fluid = None if self.fluid is None else next(rest)
-        return Particles(fields[:dim], charge, fluid, tuple(rest))
+    @property
+    def arrangement(self) -> Arrangement:
+        """How `fields` orders them."""
+        return Arrangement(len(self.position), self.charge is not None, self.fluid is not None)
 
 
 class PairTerms(eqx.Module):
@@ -60,18 +79,18 @@ class PairTerms(eqx.Module):
         cutoff: how it ends.
         core: distance [m] below which the force stops growing.
         drag: of the pair, or None.
-        particles: tells how fields are arranged.
+        arrangement: tells how fields stand in the tuples.
     """
 
     law: PairLaw
     cutoff: Cutoff
     core: Array
     drag: PairDrag | None
-    particles: Particles
+    arrangement: Arrangement
 
-    def force(self, own: Fields, other: Fields, distinct: Array) -> Fields:
+    def force(self, own: Fields, other: Fields, distinct: Array | None) -> Fields:
         """Force on the own particle [N], one array per coordinate."""
-        a, b = self.particles.like(own), self.particles.like(other)
+        a, b = self.arrangement.particles(own), self.arrangement.particles(other)
         d, squared = _difference(a, b)
         guarded = jnp.maximum(squared, self.core * self.core)
         weight = self._shared(a, b, lambda: self.cutoff.weight(self.law, guarded), lambda: self._repulsion(guarded))
@@ -82,9 +101,9 @@ class PairTerms(eqx.Module):
         weight = _if_distinct(distinct, weight)
         return tuple(weight * along for along in d)
 
-    def energy(self, own: Fields, other: Fields, distinct: Array) -> Fields:
+    def energy(self, own: Fields, other: Fields, distinct: Array | None) -> Fields:
         """Half the potential [J]: the other end counts the other half."""
-        a, b = self.particles.like(own), self.particles.like(other)
+        a, b = self.arrangement.particles(own), self.arrangement.particles(other)
         _, squared = _difference(a, b)
         guarded = jnp.maximum(squared, self.core * self.core)
         inner = (guarded - squared) / 2
@@ -99,9 +118,9 @@ class PairTerms(eqx.Module):
 
         return (_if_distinct(distinct, self._shared(a, b, full, repulsive) / 2),)
 
-    def stiffness(self, own: Fields, other: Fields, distinct: Array) -> Fields:
+    def stiffness(self, own: Fields, other: Fields, distinct: Array | None) -> Fields:
         """Twice the largest eigenvalue of -dF/dx of the pair [N/m], zero where none is positive."""
-        a, b = self.particles.like(own), self.particles.like(other)
+        a, b = self.arrangement.particles(own), self.arrangement.particles(other)
         _, squared = _difference(a, b)
         r = jnp.sqrt(jnp.maximum(squared, self.core * self.core))
         zero = jnp.zeros((), r.dtype)
@@ -115,16 +134,16 @@ class PairTerms(eqx.Module):
 
         return (_if_distinct(distinct, 2 * self._shared(a, b, full, repulsive)),)
 
-    def damping(self, own: Fields, other: Fields, distinct: Array) -> Fields:
+    def damping(self, own: Fields, other: Fields, distinct: Array | None) -> Fields:
         """Twice the drag coefficient of the pair [N s/m]."""
-        a, b = self.particles.like(own), self.particles.like(other)
+        a, b = self.arrangement.particles(own), self.arrangement.particles(other)
         _, squared = _difference(a, b)
         rate = jnp.zeros_like(squared) if self.drag is None else self.drag.rate(jnp.maximum(squared, self.core * self.core))
         return (_if_distinct(distinct, 2 * self._takes_part(a, b, rate)),)
 
-    def overlap(self, own: Fields, other: Fields, distinct: Array) -> Fields:
+    def overlap(self, own: Fields, other: Fields, distinct: Array | None) -> Fields:
         """One where the pair is closer than the core."""
-        a, b = self.particles.like(own), self.particles.like(other)
+        a, b = self.arrangement.particles(own), self.arrangement.particles(other)
         _, squared = _difference(a, b)
         close = (squared < self.core * self.core).astype(squared.dtype)
         return (_if_distinct(distinct, self._takes_part(a, b, close)),)
@@ -160,5 +179,5 @@ def _slope(function: Callable[[Array], Array], at: Array) -> Array:
     return jax.jvp(function, (at,), (jnp.ones_like(at),))[1]
 
 
-def _if_distinct(distinct: Array, value: Array) -> Array:
-    return jnp.where(distinct, value, jnp.zeros((), value.dtype))
+def _if_distinct(distinct: Array | None, value: Array) -> Array:
+    return value if distinct is None else jnp.where(distinct, value, jnp.zeros((), value.dtype))

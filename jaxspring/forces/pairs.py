@@ -1,13 +1,14 @@
 """Sums over pairs of particles: for every particle i, the sum over all j of g(i, j).
 
 `g` is evaluated twice per pair, once for each end, so that nothing is scattered: the result is the same bit for bit in every run, and the
-two halves of an antisymmetric `g` cancel exactly.
+two halves of an antisymmetric `g` cancel exactly. Derivatives: `pair_sums`.
 """
 
 from __future__ import annotations
 
 import abc
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -16,9 +17,10 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..status import Status
+from .pair_sums import Fields, summed
 
-# (own fields, other's fields, whether the two are two) -> values, all arrays that broadcast against each other.
-PairFunction = Callable[[tuple[Array, ...], tuple[Array, ...], Array], tuple[Array, ...]]
+# (own fields, other's fields, whether the two are two; None: all are) -> values, all arrays that broadcast against each other.
+PairFunction = Callable[[Fields, Fields, Array | None], Fields]
 
 # Measured on a CPU: fewer rows vectorise less, more leave the cache.
 ROWS_AT_A_TIME = 128
@@ -27,11 +29,26 @@ ROWS_AT_A_TIME = 128
 class Pairs(eqx.Module):
     """Which pairs are looked at. Abstract."""
 
-    @abc.abstractmethod
-    def sum(self, function: PairFunction, fields: tuple[Array, ...], memory: Any) -> tuple[Array, ...]:
-        """For each particle the sum of `function` over the others: arrays (N,) from fields of shape (N,).
+    def sum(self, function: Callable[..., Fields], terms: Any, fields: Fields, memory: Any, sign: int | None = None) -> Fields:
+        """For each particle the sum of `function(terms, own, other, distinct)` over the others: arrays (N,) from fields of shape (N,).
 
-        A place that holds no pair is passed with own = other; `function` must be zero there, or use its last argument.
+        Args:
+            function: see `visit`; it must close over no traced value.
+            terms: what it needs besides: a pytree that may be differentiated by.
+            fields: what the particles have.
+            memory: what `begin` and `update` gave.
+            sign: 1 where exchanging the two particles leaves the values, -1 where it turns their sign, None where it does neither.
+        """
+        arrays, static = eqx.partition(terms, eqx.is_array)
+        leaves, tree = jax.tree.flatten(arrays)
+        return summed(self, partial(_of_leaves, function, static, tree), sign, tuple(leaves), fields, memory)
+
+    @abc.abstractmethod
+    def visit(self, function: PairFunction, fields: Fields, memory: Any) -> Fields:
+        """For each particle the sum of `function` over the others; derivatives are up to `sum`.
+
+        A place that holds no pair is passed with own = other, and is False in the last argument; or, where that is None, with another
+        particle so far away that the law has no force there.
         """
 
     @property
@@ -66,7 +83,7 @@ class AllPairs(Pairs):
             raise ValueError(f"tile = {tile!r}; expected a whole number of rows, 1 or more, or None.")
         self.tile = tile
 
-    def sum(self, function: PairFunction, fields: tuple[Array, ...], memory: Any = None) -> tuple[Array, ...]:
+    def visit(self, function: PairFunction, fields: Fields, memory: Any = None) -> Fields:
         """Sum over all others, a tile of rows at a time."""
         n = fields[0].shape[0]
         tile = max(1, min(n, ROWS_AT_A_TIME if self.tile is None else self.tile))
@@ -75,7 +92,7 @@ class AllPairs(Pairs):
         numbers = jnp.arange(n, dtype=jnp.int32)
 
         # The sum runs down the columns, whose accumulators are the rows of the tile: that loop vectorises.
-        def of_tile(rows: tuple[Array, tuple[Array, ...]]) -> tuple[Array, ...]:
+        def of_tile(rows: tuple[Array, Fields]) -> Fields:
             own_numbers, own = rows
             values = function(tuple(a[None, :] for a in own), everyone, own_numbers[None, :] != numbers[:, None])
             return tuple(jnp.sum(value, axis=0) for value in values)
@@ -89,3 +106,7 @@ class AllPairs(Pairs):
         # Rematerialised, so that a gradient keeps no tile either.
         sums = jax.lax.map(jax.checkpoint(of_tile), jax.tree.map(tiled, (numbers, fields)))
         return tuple(a.reshape(n_tiles * tile)[:n] for a in sums)
+
+
+def _of_leaves(function: Any, static: Any, tree: Any, leaves: Fields, own: Fields, other: Fields, distinct: Any) -> Fields:
+    return function(eqx.combine(jax.tree.unflatten(tree, leaves), static), own, other, distinct)

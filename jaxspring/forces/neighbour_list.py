@@ -29,7 +29,7 @@ from .pairs import AllPairs, PairFunction, Pairs
 
 Fields = tuple[Array, ...]
 
-# Neighbours taken at a time: fewer write the sums more often, more compile longer.
+# Neighbours taken at a time: fewer write the sums more often; more make loops that XLA shares between cores though they are short.
 SLOTS = 4
 
 

@@ -28,7 +28,10 @@ N_NEWTON = 60
 
 
 class PairLaw(eqx.Module):
-    """Force and potential of one pair. Abstract; subclass it for a law of your own."""
+    """Force and potential of one pair. Abstract; subclass it for a law of your own, finite at every distance above zero.
+
+    Also beyond its cut-off: an empty place of a neighbour list is a pair at 1e18 m (1e152 in float64), whose force the cut-off then drops.
+    """
 
     @property
     def uses_mass(self) -> bool:

@@ -84,7 +84,7 @@ def test_no_scatter(pairs, rng):
 
 @CHOICES
 def test_derivatives_by_everything(pairs, rng):
-    """Of a dragged, half molten fluid of uneven masses by positions, speeds, masses and constants: the dot test, and central differences."""
+    """A dragged, half molten fluid of uneven masses, by positions, speeds, masses and constants: the dot test, and central differences."""
     points, n = blob(rng, 20), 20
     net = js.Graph.from_edges([[i, i + 1] for i in range(0, n // 2)], n)
     alive = js.EdgeField((jnp.ones(net.n_springs, bool),))
@@ -110,7 +110,8 @@ def test_derivatives_by_everything(pairs, rng):
         pulled = sum(jnp.sum(a * b) for a, b in zip(jax.tree.leaves(backward), jax.tree.leaves(ways), strict=True))
         return dot(forward, weights), pulled, dot(ahead - behind, weights) / 2e-6
 
-    one_at_a_time = [jax.tree.map(jnp.zeros_like, ways[:i]) + (ways[i],) + jax.tree.map(jnp.zeros_like, ways[i + 1 :]) for i in range(7)]
+    still = jax.tree.map(jnp.zeros_like, ways)
+    one_at_a_time = [(*still[:i], ways[i], *still[i + 1 :]) for i in range(len(ways))]
     for way in [ways, *one_at_a_time]:
         forward, backward, difference = (float(a) for a in products(at, way))
         assert forward != 0

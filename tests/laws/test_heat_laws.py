@@ -1,6 +1,9 @@
 """Heat is kept and makes no new extreme, whatever the body, the step and the scheme: properties of random bodies."""
 
+import itertools
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -72,6 +75,44 @@ def test_no_new_extreme(scheme, melts, seed, log_dt, log_latent):
         slack = 1e-4 * float(jnp.ptp(t))
         assert float(jnp.min(t)) - slack <= float(jnp.min(end)) <= float(jnp.max(end)) <= float(jnp.max(t)) + slack
     assert np.all(np.isfinite(end))
+
+
+def by_trial(g, t, latent):
+    """Temperatures and latent heats of a chain of three after a backward step of 1 s (C = 1, melting at 350): of the 27 ways in which its
+    nodes can be solid, melting or liquid, the one whose linear system has an answer of that kind.
+    """
+    a = np.eye(3) + np.array([[g[0], -g[0], 0], [-g[0], g[0] + g[1], -g[1]], [0, -g[1], g[1]]])
+    heat = t - 350 + latent * (t > 350)
+    for phases in itertools.product((-1, 0, 1), repeat=3):
+        phase = np.array(phases)
+        moves, over, h = phase != 0, np.zeros(3), np.where(phase == 1, latent, 0.0)
+        over[moves] = np.linalg.solve(a[np.ix_(moves, moves)], (heat - h)[moves])
+        h = np.where(moves, h, heat - a @ over)
+        if np.all(over * phase >= 0) and np.all((h >= 0) & (h <= latent)):
+            return 350 + over, h
+    raise AssertionError("no phases fit")
+
+
+@pytest.mark.slow
+def test_every_chain_that_melts_is_solved(rng):
+    """Conductances over five decades, latent heat over three: each of 400 long steps is found; full Newton steps cycle in many."""
+    net, n = js.lattice(3), 400
+    g, latent = 10.0 ** rng.integers(-2, 4, (n, 2)), 10.0 ** rng.integers(0, 4, n)
+    t = rng.integers(300, 401, (n, 3)).astype(float)
+
+    @jax.jit
+    @jax.vmap
+    def step(g, t, latent):
+        heat = js.Heat(net, 1.0, g, js.SplitHeat(), latent=js.LatentHeat(350.0, latent))
+        start = js.State.from_points(net, net.grid(), temperature=t)
+        end = js.rollout(js.System(net, 1.0, rules=heat), start, js.Still(), 1.0, 1)
+        return end.status.flags, end.state.temperature, end.state.enthalpy
+
+    flags, temperature, enthalpy = step(*(jnp.asarray(a) for a in (g, t, latent)))
+    np.testing.assert_array_equal(flags, 0)
+    expected = [by_trial(*chain) for chain in zip(g, t, latent, strict=True)]
+    np.testing.assert_allclose(temperature, [theta for theta, _ in expected], atol=1e-5)
+    np.testing.assert_allclose(enthalpy, [h for _, h in expected], atol=1e-4)
 
 
 @pytest.mark.slow

@@ -120,7 +120,7 @@ def test_boundaries_by_hand(rng):
         (js.Convection(net, nodes, h, 280.0, area), nodes * h * area * (280.0 - t)),
         (js.Radiation(net, nodes, 0.8, lambda time: 500.0 + time, area), nodes * 0.8 * 5.670374419e-8 * area * (500.0**4 - t**4)),
         (plane, np.array([1, 1, 0.5, 0]) * 7.0 * 0.5 * (1000.0 - t)),
-        (js.HotPlane((9, 9, 0.1), (0, 0, 1), 1000.0, 7.0, 0.5, reach=0.0), np.array([1, 1, 0, 0]) * 3.5 * (1000.0 - t)),
+        (js.HotPlane((9, 9, 0.02), (0, 0, 1), 1000.0, 7.0, 0.5, reach=0.08), np.array([1, 1, 0, 0]) * 3.5 * (1000.0 - t)),
     ]
     state = js.State.from_points(net, points, temperature=t)
     for boundary, expected in terms:
@@ -166,11 +166,11 @@ def test_radiation_pulls_back_below_zero():
 
 
 def test_heat_steps_within_a_step_see_their_own_time():
-    """A source t^2 in explicit substeps of a tenth of dt adds the sum of t_i^2 dt / 10; with `every`, the time begins where heat stood."""
+    """Explicit steps take a source at their start: t^2 in steps, or substeps, of 0.05 s adds the sum of t_i^2 0.05, also with `every`."""
     net = js.lattice(1)
-    for options, n_steps in (({"substeps": 10}, 2), ({"substeps": 20, "every": 2}, 2)):
+    for options, dt, n_steps in (({}, 0.05, 20), ({"substeps": 10}, 0.5, 2), ({"substeps": 20, "every": 2}, 0.5, 2)):
         heat = js.Heat(net, 1.0, 0.0, source=lambda t: t * t, **options)
-        end = run(heat, 300.0, 0.5, n_steps, points=np.zeros((1, 1)))
+        end = run(heat, 300.0, dt, n_steps, points=np.zeros((1, 1)))
         assert float(end.temperature[0]) == pytest.approx(300 + np.sum((0.05 * np.arange(20)) ** 2) * 0.05, rel=1e-14)
 
 

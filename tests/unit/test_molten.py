@@ -54,6 +54,13 @@ def test_a_particle_is_fluid_when_its_last_spring_has_broken():
     assert np.asarray(lonely.flatten_nodes(js.Molten(lonely).is_fluid(at))).tolist() == [False, False, True]
 
 
+def test_melted_fraction():
+    """Two of five particles without a living spring: 0.4; none, and all of them, at the ends."""
+    net, _, state = scene()
+    for alive, share in (([0, 0, 1, 1], 0.4), ([1, 1, 1, 1], 0.0), ([0, 0, 0, 0], 1.0)):
+        assert float(js.melted_fraction(net, with_springs(net, state, alive))) == share
+
+
 @pytest.mark.parametrize("pairs", [js.AllPairs(), js.AllPairs(2), js.NeighbourList(8, 0.5)], ids=["all", "tiles", "list"])
 def test_mixed_pairs_repel_only(pairs):
     """Two fluid particles have the whole law, a fluid and a solid one its repulsion, two solid ones nothing; pair by pair in NumPy."""

@@ -36,12 +36,15 @@ def test_a5_implicit_lone_node():
 
 
 def test_a12_implicit_negative_stiffness():
-    """Negative stiffness: the exact matrix is called indefinite; the clamped one drops the spring's part: the step of its force alone."""
+    """Negative stiffness: the exact matrix is called indefinite, but not where dt = 0 asks for no solve; the clamped one drops the spring's
+    part: the step of its force alone.
+    """
     net = js.lattice(2)
     start = js.State.from_points(net, [[0.0], [1.5]])
     system = js.System(net, 1.0, js.Springs(net, -10.0, 1.0, allow_negative_stiffness=True))
     exact = js.rollout(system, start, js.BackwardEuler(stiffness=js.ExactTangent()), 1.0, 1)
     assert bool(exact.status.has(Flag.CG_INDEFINITE))
+    assert int(js.rollout(system, start, js.BackwardEuler(stiffness=js.ExactTangent()), 0.0, 1).status.flags) == Flag.OK
     clamped = js.rollout(system, start, js.BackwardEuler(), 1.0, 1)
     assert bool(clamped.status.is_ok)
     # a = -k (r - l) / m = 5 m/s^2 outward on either node, one second long.
@@ -61,6 +64,22 @@ def test_a13_no_time_and_time_reversed(stepper):
     with pytest.raises(ValueError, match=r"dt = -0\.1, but .* does not run backward"):
         js.rollout(system, start, stepper, -0.1, 2)
     assert bool(jax.jit(lambda dt: js.rollout(system, start, stepper, dt, 1).status)(-0.1).has(Flag.INVALID))
+
+
+@pytest.mark.slow
+@each_stepper
+def test_a13_no_time_has_a_derivative(stepper):
+    """With dt = 0 the derivative of the end by the start is the identity, not what a division by dt would make of it."""
+    net = js.lattice(3)
+    start = js.State.from_points(net, [[0.0], [1.1], [2.5]], [[0.3], [0.0], [-0.2]])
+    system = js.System(net, 1.0, js.Springs(net, 10.0, 1.0))
+    weights = jnp.asarray([2.0, -3.0, 5.0])
+
+    def weighed(x):
+        end = js.rollout(system, start.moved(js.Vector((x,)), start.velocity), stepper, 0.0, 2).state
+        return jnp.sum(weights * end.position.x)
+
+    np.testing.assert_array_equal(jax.grad(weighed)(start.position.x), weights)
 
 
 @pytest.mark.slow
@@ -107,6 +126,7 @@ def test_c9_a_free_chain_at_rest(solver):
     assert bool(info.status.has(Flag.CG_INDEFINITE) | info.status.has(Flag.CG_MAXITER))
     x, info = solve(np.zeros(10))
     assert bool(info.status.is_ok)
+    assert int(info.iterations) == 0
     np.testing.assert_array_equal(x.x, 0.0)
 
 

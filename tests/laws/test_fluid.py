@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.optimize
 
 import jaxspring as js
 from tests.particles import blob, components, make, slide_force
@@ -47,9 +48,13 @@ def test_other_exponents(kind, exponents):
 
 
 def test_the_equilibrium_distance_can_be_differentiated():
-    """With zeta = 0, r_0 = (beta / alpha)^(1/(b-a)), and so is its derivative, also where r_0 is found by Newton's method."""
-    slope = jax.grad(lambda beta: js.SlideLaw(1.0, beta, 0.0, a=2, b=5).equilibrium_distance)(2.0)
-    assert float(slope) == pytest.approx(2.0 ** (1 / 3 - 1) / 3, rel=1e-12)
+    """With zeta = 0, r_0 = (beta / alpha)^(1/(b-a)); else Newton's method finds r_0, and beta (r + zeta)^2 = alpha r^5 holds along it."""
+    slope = jax.grad(lambda zeta, beta: js.SlideLaw(1.0, beta, zeta, a=2, b=5).equilibrium_distance, argnums=(0, 1))
+    assert float(slope(0.0, 2.0)[1]) == pytest.approx(2.0 ** (1 / 3 - 1) / 3, rel=1e-12)
+    r = float(js.SlideLaw(1.0, 2.0, 0.3, a=2, b=5).equilibrium_distance)
+    assert 2 * (r + 0.3) ** 2 == pytest.approx(r**5, rel=1e-12)
+    stiff = 5 * r**4 - 4 * (r + 0.3)
+    np.testing.assert_allclose(slope(0.3, 2.0), [4 * (r + 0.3) / stiff, (r + 0.3) ** 2 / stiff], rtol=1e-12)
 
 
 def test_gentle_fluid_rests_at_the_spacing():
@@ -76,6 +81,99 @@ def test_forces_as_printed(rng):
     for tile in (None, 7):
         system, state = make(points, mass, pairs=js.AllPairs(tile))
         np.testing.assert_allclose(components(system.force(state)), slide_force(points, mass), rtol=1e-11, atol=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("law", "printed"),
+    [
+        (js.UnitVectorLaw(1.0, 1.3, 0.1), lambda r, m: m * (-1 / (r + 0.1) ** 2 + 1.3 / r**4)),
+        (js.LennardJones(0.7, 0.9), lambda r, m: 24 * 0.7 / r * (2 * (0.9 / r) ** 12 - (0.9 / r) ** 6)),
+    ],
+    **by_name,
+)
+def test_other_laws_as_printed(law, printed, rng):
+    """The push between two particles of 2 kg and 3 kg: both masses enter the unit-vector law, neither enters Lennard-Jones."""
+    for r in (0.8, 1.7):
+        system, state = make(np.array([[0.0, 0.0], [r, 0.0]]), np.array([2.0, 3.0]), law)
+        push = printed(r, 6.0)
+        np.testing.assert_allclose(components(system.force(state)), [[-push, 0], [push, 0]], rtol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("law", "repulsion"),
+    [
+        (js.SlideLaw(1.0, 1.3, 0.1), lambda r: 1.3 / (2 * r**2)),
+        (js.UnitVectorLaw(1.0, 1.3, 0.1), lambda r: 1.3 / (3 * r**3)),
+        (js.LennardJones(0.7, 0.9), lambda r: 4 * 0.7 * (0.9 / r) ** 12),
+    ],
+    **by_name,
+)
+def test_stiffness_where_two_particles_turn(law, repulsion):
+    """The curvature of the repulsion's potential where that is the energy, or at the core where they would come closer than it."""
+    r = scipy.optimize.brentq(lambda r: repulsion(r) - 5.0, 0.1, 10.0, xtol=1e-14)
+    curvature = jax.grad(jax.grad(repulsion))
+    for core, at in ((0.01, r), (2 * r, 2 * r)):
+        stiffness = law.turning_stiffness(jnp.asarray(5.0), jnp.asarray(core))
+        assert float(stiffness) == pytest.approx(float(curvature(at)), rel=1e-11)
+
+
+@pytest.mark.parametrize("law", [js.SlideLaw(1.0, 1.3, 0.1), js.LennardJones(0.7, 0.9)], **by_name)
+def test_step_for_a_collision(law):
+    """Two of mass m at speed v turn where the pair has taken up m v^2; there they swing at sqrt(2 k / m). The worst particle is named."""
+    mass, speed = np.array([1.0, 3.0, 0.5]), np.array([2.0, 4.0, 1.0])
+    velocities = np.c_[np.zeros(3), speed]
+    system, state = make(np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 3.0]]), mass, law, velocities)
+    charge = mass**2 if isinstance(law, js.SlideLaw) else np.ones(3)
+    energy = mass * speed**2 / charge
+    # Per q_i q_j: 3 beta / r^4 where beta / (2 r^2) is the energy; 624 epsilon sigma^12 / r^14 where 4 epsilon (sigma / r)^12 is.
+    k = 12 * energy**2 / 1.3 if isinstance(law, js.SlideLaw) else 624 * 0.7 / 0.9**2 * (energy / 2.8) ** (14 / 12)
+    expected = 2 / np.sqrt(2 * charge * k / mass)
+    limit, node = system.prepare(state.dtype).forces[0].collision_dt(state)
+    assert float(limit) == pytest.approx(expected.min(), rel=1e-12)
+    assert int(node) == expected.argmin() == 1
+
+
+def test_a_step_too_long_for_a_collision_is_told_in_both_directions():
+    """DT_LIMIT above the limit of the speeds after the step, for dt above zero and below; nothing a hair below it."""
+    system, state = make(np.array([[-2.0, 0.0], [2.0, 0.0]]), velocities=np.array([[1.0, 0.0], [-5.0, 0.0]]))
+    fluid = system.prepare(state.dtype).forces[0]
+    limit = float(fluid.collision_dt(state)[0])
+    slow = state.moved(state.position, 0.1 * state.velocity)
+    for before, after, share, is_told in ((slow, state, 1.01, True), (slow, state, 0.99, False), (state, slow, 1.01, False)):
+        for sign in (1, -1):
+            status = fluid.update(before, after, jnp.asarray(sign * share * limit))[1]
+            assert bool(status.has(js.Flag.DT_LIMIT)) == is_told
+
+
+def test_drag_as_printed(rng):
+    """-eta (1 - r/R)^2 ((v_i - v_j) . u) u for every pair nearer than R, nothing beyond; pair by pair in NumPy, beside the law's force."""
+    points, velocities = blob(rng, 20), rng.normal(size=(20, 3))
+    system, state = make(points, velocities=velocities, drag=js.PairDrag(0.7, 1.6))
+    expected = slide_force(points, np.ones(20))
+    n_near = 0
+    for i in range(20):
+        for j in range(20):
+            r = np.linalg.norm(points[i] - points[j])
+            if i != j and r < 1.6:
+                u = (points[i] - points[j]) / r
+                expected[i] -= 0.7 * (1 - r / 1.6) ** 2 * np.dot(velocities[i] - velocities[j], u) * u
+                n_near += 1
+    assert 0 < n_near < 380
+    np.testing.assert_allclose(components(system.force(state)), expected, rtol=1e-11, atol=1e-12)
+
+
+@pytest.mark.parametrize("cutoff", CUTOFFS[1:], **by_name)
+@pytest.mark.parametrize("law", LAWS, **by_name)
+def test_a_cut_off_ends_without_a_step_in_energy(law, cutoff):
+    """The potential is zero at the radius and beyond, and continuous; switched, the law is untouched up to where it starts to fade."""
+    hair, c = 1e-9, 2.3
+    assert abs(float(cutoff.potential(law, jnp.asarray((c - hair) ** 2)))) < 1e-8
+    for r in (c, 5.0):
+        assert float(cutoff.potential(law, jnp.asarray(r * r))) == float(cutoff.weight(law, jnp.asarray(r * r))) == 0
+    if isinstance(cutoff, js.Switched):
+        at = jnp.linspace(0.6, 1.6, 6) ** 2
+        np.testing.assert_allclose(cutoff.weight(law, at), law.weight(at), rtol=1e-13)
+        np.testing.assert_allclose(cutoff.potential(law, at), law.potential(at) - law.potential(jnp.asarray(c * c)), rtol=1e-12)
 
 
 @pytest.mark.parametrize("cutoff", CUTOFFS, **by_name)
@@ -183,6 +281,13 @@ def test_forces_add_up_to_nothing(seed, which, has_drag):
     scale = np.abs(force).max() * 16
     assert np.abs(force.sum(axis=0)).max() < 1e-14 * scale
     assert np.abs(np.cross(points, force).sum(axis=0)).max() < 1e-13 * scale
+
+
+@pytest.mark.parametrize(("r", "stiffness"), [(0.8, 3 / 0.8**4 - 1 / 0.8**2), (3.0, 1 / 3**2 - 1 / 3**4)])
+def test_bound_of_stiffness_of_a_pair(r, stiffness):
+    """Two particles: the bound is exact, 2 / sqrt(2 k), k along the pair where near, and across it where they attract from afar."""
+    system, state = make(np.array([[0.0, 0.0], [r, 0.0]]), law=js.SlideLaw(1.0, 1.0))
+    assert float(js.stable_dt(system, state)) == pytest.approx(2 / np.sqrt(2 * stiffness), rel=1e-12)
 
 
 def test_bound_of_stiffness_holds(rng):

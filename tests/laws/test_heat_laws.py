@@ -1,6 +1,9 @@
 """Heat is kept and makes no new extreme, whatever the body, the step and the scheme: properties of random bodies."""
 
+import itertools
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,6 +12,7 @@ from hypothesis import strategies as st
 
 import jaxspring as js
 from jaxspring.status import Flag
+from jaxspring.thermal.phase import Equation, relaxed, searched
 
 NET = js.lattice((3, 4))
 GRAPH = js.Graph.from_edges(NET.edges[::-1], 12)
@@ -72,6 +76,87 @@ def test_no_new_extreme(scheme, melts, seed, log_dt, log_latent):
         slack = 1e-4 * float(jnp.ptp(t))
         assert float(jnp.min(t)) - slack <= float(jnp.min(end)) <= float(jnp.max(end)) <= float(jnp.max(t)) + slack
     assert np.all(np.isfinite(end))
+
+
+def by_trial(c, g, t, latent):
+    """Temperatures and latent heats of a chain of three after a backward step of 1 s, melting at 350: of the 27 ways in which its nodes
+    can be solid, melting or liquid, the one whose linear system has an answer of that kind.
+    """
+    a = np.diag(c) + np.array([[g[0], -g[0], 0], [-g[0], g[0] + g[1], -g[1]], [0, -g[1], g[1]]])
+    heat = c * (t - 350) + latent * (t > 350)
+    for phases in itertools.product((-1, 0, 1), repeat=3):
+        phase = np.array(phases)
+        moves, over, h = phase != 0, np.zeros(3), np.where(phase == 1, latent, 0.0)
+        over[moves] = np.linalg.solve(a[np.ix_(moves, moves)], (heat - h)[moves])
+        h = np.where(moves, h, heat - a @ over)
+        if np.all(over * phase >= 0) and np.all((h >= 0) & (h <= latent)):
+            return 350 + over, h
+    raise AssertionError("no phases fit")
+
+
+@pytest.mark.slow
+def test_every_chain_that_melts_is_solved(rng):
+    """Conductances over five decades, latent heat over three: each of 400 long steps is found; full Newton steps cycle in many."""
+    net, n = js.lattice(3), 400
+    c, g, latent = rng.uniform(0.5, 2, (n, 3)), 10.0 ** rng.integers(-2, 4, (n, 2)), 10.0 ** rng.integers(0, 4, n)
+    t = rng.integers(300, 401, (n, 3)).astype(float)
+
+    @jax.jit
+    @jax.vmap
+    def step(c, g, t, latent):
+        heat = js.Heat(net, c, g, js.SplitHeat(), latent=js.LatentHeat(350.0, latent))
+        start = js.State.from_points(net, net.grid(), temperature=t)
+        end = js.rollout(js.System(net, 1.0, rules=heat), start, js.Still(), 1.0, 1)
+        return end.status.flags, end.state.temperature, end.state.enthalpy
+
+    flags, temperature, enthalpy = step(*(jnp.asarray(a) for a in (c, g, t, latent)))
+    np.testing.assert_array_equal(flags, 0)
+    expected = [by_trial(*chain) for chain in zip(c, g, t, latent, strict=True)]
+    np.testing.assert_allclose(temperature, [theta for theta, _ in expected], atol=1e-5)
+    np.testing.assert_allclose(enthalpy, [h for _, h in expected], atol=1e-4)
+
+
+@pytest.mark.slow
+def test_what_a_melting_step_minimises_falls(rng):
+    """F of `phase.py`, in NumPy: no higher after a relaxation; after a search the lowest of Newton's step, its halves, and the one that
+    stops at the melting point.
+    """
+    k, n_crossed = np.zeros((12, 12)), 0
+
+    @jax.jit
+    def both(c, g, t0, y, latent, dt, dtheta, loss):
+        cooling = js.Convection(NET, np.ones(12, bool), loss, 300.0, 1.0)
+        heat = js.Heat(NET, c, g, boundaries=cooling, latent=js.LatentHeat(350.0, latent)).prepare(y.dtype)
+        flow = heat.flow(js.State.from_points(NET, NET.grid(), temperature=y), cuts=False)
+        equation = Equation(flow, flow.entered(t0, None), dt, jnp.ones(()))
+        found = searched(equation, equation.matrix(y), y, equation.missing(y), dtheta)
+        return flow.temperature(relaxed(equation, y)) - 350, flow.temperature(found) - 350
+
+    for seed in range(60):
+        c, g, t0 = map(np.asarray, body(seed)[1:])
+        latent, dt, loss = 10.0 ** rng.uniform(0, 3), 10.0 ** rng.uniform(-2, 2), 10.0 ** rng.uniform(-2, 3, 12)
+        k[:] = 0
+        for (a, b), conductance in zip(NET.edges, g, strict=True):
+            k[[a, b], [a, b]] += conductance
+            k[[a, b], [b, a]] -= conductance
+        matrix = np.diag(c + dt * loss) + dt * k
+        heat = c * (t0 - 350) + latent * (t0 > 350) - dt * loss * 50.0
+        h = latent * rng.integers(0, 2, 12)
+        over = rng.uniform(0, 50, 12) * np.where(h > 0, 1, -1)  # each node solid or liquid
+
+        def f(over, matrix=matrix, heat=heat, latent=latent):
+            return over @ matrix @ over / 2 - heat @ over + latent * np.maximum(over, 0).sum()
+
+        dtheta = np.linalg.solve(matrix, heat - h - matrix @ over)
+        shaped = [jnp.asarray(a).reshape(3, 4) for a in (t0, over + h / c, dtheta)]
+        rested, reached = (np.ravel(a) for a in both(c, g, shaped[0], shaped[1], latent, dt, shaped[2], loss))
+        crosses = over * (over + dtheta) < 0
+        tried = [over + 0.5**i * dtheta for i in range(13 if crosses.any() else 1)] + [np.where(crosses, 0, over + dtheta)]
+        slack = 1e-12 * (abs(f(over)) + over @ matrix @ over + abs(heat) @ abs(over))
+        assert f(rested) <= f(over) + slack
+        assert f(reached) <= min(map(f, tried)) + slack
+        n_crossed += crosses.any()
+    assert n_crossed > 40
 
 
 @pytest.mark.slow

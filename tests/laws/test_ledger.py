@@ -93,3 +93,59 @@ def test_a_start_below_the_floor_is_lifted_by_the_floor():
     book = resting_on_a_floor(-1.0)
     assert book["rules"]["Floor"]["Gravity"] == pytest.approx(20.0, rel=1e-2)
     assert abs(book["integration"]) < 1.01 * 2.0 * 10.0**2 * 0.01**2  # what it fell in the first step, m g^2 dt^2
+
+
+@pytest.mark.slow
+def test_a_ledger_changes_nothing():
+    """The rules within a ledger act in their order, to the last bit as without it: heat first, then what it melts, contact last."""
+    start = js.State.from_points(NET, NET.grid() + np.array([0.0, 0.02]), temperature=300.0)
+    frames = {}
+    for has_books in (True, False):
+        heat = js.Heat(js.lattice((3, 4)), 1.0, 1.0, boundaries=js.HotPlane(GROUND, UP, 500.0, 6.0, 1.0, reach=0.5))
+        rules = (heat, js.Fusing(NET, 350.0), js.Floor(GROUND, UP, 0.2))
+        forces = (js.Springs(NET, js.ThermalStiffness(40.0, 310.0, 350.0), 0.9), js.Gravity((0.0, -6.0)))
+        system = js.System(NET, 1.0, forces, rules=js.Ledger(rules) if has_books else rules)
+        # Every step: in another order springs would fuse one step later.
+        frames[has_books] = js.rollout(system, start, js.SymplecticEuler(), 2e-3, 200, save_every=1, observe=seen).saved
+    for a, b in zip(frames[True], frames[False], strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def seen(state):
+    """What a rule may change: places, velocities, temperatures, and which springs are alive."""
+    return (*state.position, *state.velocity, state.temperature, *state.alive.families)
+
+
+def molten_pair(rule, drag=None, dt=1e-3, n_steps=1):
+    """Two free particles and one on a spring that is heated above 350 K at once; the books, the system and the end."""
+    net = js.Graph.from_edges(np.array([[2, 3]]), 4)
+    fluid = js.Fluid(js.SlideLaw(1.0, 1.0), drag=drag, molten=js.Molten(net))
+    system = js.System(net, 1.0, (js.Springs(net, 10.0, 1.0), fluid), rules=js.Ledger(rule(net)))
+    points = [[0.0, 0.0], [1.3, 0.0], [0.0, 0.8], [1.3, 0.9]]
+    start = js.State.from_points(net, points, [[0.5, 0], [-0.5, 0], [0, 0.3], [0, 0]], temperature=400.0)
+    end = js.rollout(system, start, js.SymplecticEuler(), dt, n_steps).state
+    return js.energy_ledger(system, end), system, end
+
+
+@pytest.mark.slow
+def test_what_fusing_does_to_the_fluid_is_fusings():
+    """A spring that fuses lets its particles attract: the change of the fluid's potential is booked by that rule, in that step."""
+    book, system, end = molten_pair(lambda net: js.Fusing(net, 350.0))
+    potential = float(system.energy(end).potential[1])
+    assert book["end"]["Fluid"] == pytest.approx(potential, rel=1e-12)
+    whole, _, _ = molten_pair(lambda net: js.Fusing(net, 450.0))
+    assert abs(potential - whole["end"]["Fluid"]) > 0.1
+    assert book["rules"]["Fusing"]["Fluid"] == pytest.approx(potential - whole["end"]["Fluid"], rel=1e-12)
+    assert abs(book["residual"]) < 1e-12
+
+
+@pytest.mark.slow
+def test_work_of_drag_between_particles():
+    """Of a fluid with drag, only the drag is work; the rest is its potential. What is left is the error of the steps, of order one."""
+    error = []
+    for n_steps in (100, 800):
+        book, system, end = molten_pair(lambda net: js.Fusing(net, 350.0), js.PairDrag(0.5, 2.0), 0.4 / n_steps, n_steps)
+        assert book["work"]["Fluid"] < -0.05
+        error.append(abs(book["integration"]))
+    assert 6 < error[0] / error[1] < 10
+    assert book["end"]["Fluid"] == pytest.approx(float(system.energy(end).potential[1]), rel=1e-12)

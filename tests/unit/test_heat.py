@@ -120,7 +120,7 @@ def test_boundaries_by_hand(rng):
         (js.Convection(net, nodes, h, 280.0, area), nodes * h * area * (280.0 - t)),
         (js.Radiation(net, nodes, 0.8, lambda time: 500.0 + time, area), nodes * 0.8 * 5.670374419e-8 * area * (500.0**4 - t**4)),
         (plane, np.array([1, 1, 0.5, 0]) * 7.0 * 0.5 * (1000.0 - t)),
-        (js.HotPlane((0, 0, 0), (0, 0, 1), 1000.0, 7.0, 0.5, reach=0.1), np.array([1, 1, 0, 0]) * 3.5 * (1000.0 - t)),
+        (js.HotPlane((9, 9, 0.02), (0, 0, 1), 1000.0, 7.0, 0.5, reach=0.08), np.array([1, 1, 0, 0]) * 3.5 * (1000.0 - t)),
     ]
     state = js.State.from_points(net, points, temperature=t)
     for boundary, expected in terms:
@@ -130,6 +130,59 @@ def test_boundaries_by_hand(rng):
         slope = boundary.slope(state, state.temperature)
         by_hand = js.ThermalBoundary.slope(boundary, state, state.temperature)
         np.testing.assert_allclose(jnp.zeros(4) if slope is None else slope, by_hand, rtol=1e-12)
+
+
+def test_limit_of_an_explicit_step():
+    """C / (sum of G and slopes) of the worst node that is free: a plane counts as if all touched it, radiation at the hotter one."""
+    net = js.lattice(4)
+    c, g, t = np.array([1.0, 2.0, 3.0, 4.0]), np.array([90.0, 2.0, 3.0]), np.array([300.0, 310.0, 320.0, 400.0])
+    boundaries = (
+        js.FixedTemperature(net, np.arange(4) == 0, 300.0),
+        js.Radiation(net, np.arange(4) == 2, 0.2, 900.0, 2.0),
+        js.Convection(net, np.arange(4) == 3, 7.0, 280.0, 0.5),
+        js.HotPlane((0.0,), (1.0,), 400.0, 5.0, 0.2, reach=-99.0),
+    )
+    radiation = 4 * 0.2 * 5.670374419e-8 * 2.0 * 900.0**3
+    rate = (np.array([90.0, 92.0, 5.0, 3.0]) + [0, 0, radiation, 3.5] + 1.0) / c
+    state = js.State.from_points(net, net.grid(), temperature=t)
+    for held, worst in ((boundaries, rate[1:].max()), (boundaries[1:], rate.max())):
+        limit = js.Heat(net, c, g, boundaries=held).limit(state)
+        assert float(limit) == pytest.approx(1 / worst, rel=1e-12)
+    assert rate[2] < rate[1] < rate[0]
+    hot = js.Heat(net, c, [1.0, 2.0, 3.0], boundaries=boundaries[:2])
+    assert float(hot.limit(state)) == pytest.approx(3.0 / (5.0 + radiation), rel=1e-12)
+    seldom = js.Heat(net, c, g, boundaries=boundaries, substeps=6, every=2)
+    assert float(seldom.limit(state)) == pytest.approx(3 / rate[1:].max(), rel=1e-12)
+
+
+def test_radiation_pulls_back_below_zero():
+    """Below 0 K, where a step too long may lead, the loss is odd: -50 K lacks what 50 K radiates, and the slope is its derivative."""
+    net, factor = js.lattice(2), 0.8 * 5.670374419e-8 * 0.5
+    boundary = js.Radiation(net, np.ones(2, bool), 0.8, 300.0, 0.5)
+    state = js.State.from_points(net, net.grid(), temperature=[-50.0, 50.0])
+    np.testing.assert_allclose(boundary.power(state, state.temperature), factor * (300.0**4 + np.array([1, -1]) * 50.0**4), rtol=1e-13)
+    slope = js.ThermalBoundary.slope(boundary, state, state.temperature)
+    np.testing.assert_allclose(boundary.slope(state, state.temperature), slope, rtol=1e-12)
+
+
+def test_heat_steps_within_a_step_see_their_own_time():
+    """Explicit steps take a source at their start: t^2 in steps, or substeps, of 0.05 s adds the sum of t_i^2 0.05, also with `every`."""
+    net = js.lattice(1)
+    for options, dt, n_steps in (({}, 0.05, 20), ({"substeps": 10}, 0.5, 2), ({"substeps": 20, "every": 2}, 0.5, 2)):
+        heat = js.Heat(net, 1.0, 0.0, source=lambda t: t * t, **options)
+        end = run(heat, 300.0, dt, n_steps, points=np.zeros((1, 1)))
+        assert float(end.temperature[0]) == pytest.approx(300 + np.sum((0.05 * np.arange(20)) ** 2) * 0.05, rel=1e-14)
+
+
+def test_what_starts_at_the_melting_point_is_solid():
+    """Up to the melting point no latent heat has been taken up, above it all; a node at it then melts at a constant temperature."""
+    net = js.lattice(3)
+    heat = js.Heat(net, 2.0, 0.0, latent=js.LatentHeat(350.0, 20.0), source=10.0)
+    start = heat.begin(js.State.from_points(net, net.grid(), temperature=[349.0, 350.0, 351.0]))
+    np.testing.assert_array_equal(start.enthalpy, [0, 0, 20])
+    end = run(heat, np.array([349.0, 350.0, 351.0]), 0.1, 5)
+    np.testing.assert_allclose(end.temperature, [350.0, 350.0, 353.5], rtol=1e-14)
+    np.testing.assert_allclose(end.enthalpy, [3.0, 5.0, 20.0], rtol=1e-12)
 
 
 def test_springs_that_broke_do_not_conduct():

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.integrate
 
 import jaxspring as js
 from jaxspring.forces.cutoffs import Cutoff
@@ -53,6 +54,13 @@ def test_a_particle_is_fluid_when_its_last_spring_has_broken():
     assert np.asarray(lonely.flatten_nodes(js.Molten(lonely).is_fluid(at))).tolist() == [False, False, True]
 
 
+def test_melted_fraction():
+    """Two of five particles without a living spring: 0.4; none, and all of them, at the ends."""
+    net, _, state = scene()
+    for alive, share in (([0, 0, 1, 1], 0.4), ([1, 1, 1, 1], 0.0), ([0, 0, 0, 0], 1.0)):
+        assert float(js.melted_fraction(net, with_springs(net, state, alive))) == share
+
+
 @pytest.mark.parametrize("pairs", [js.AllPairs(), js.AllPairs(2), js.NeighbourList(8, 0.5)], ids=["all", "tiles", "list"])
 def test_mixed_pairs_repel_only(pairs):
     """Two fluid particles have the whole law, a fluid and a solid one its repulsion, two solid ones nothing; pair by pair in NumPy."""
@@ -78,6 +86,58 @@ def test_energy_of_mixed_pairs_gives_their_force():
     fluid = system.prepare(state.dtype).forces[1]
     slope = jax.grad(lambda x: fluid.energy(state.moved(x, state.velocity)))(state.position)
     np.testing.assert_allclose(components(slope), -force_of_fluid(system, state), atol=1e-14)
+
+
+@pytest.mark.parametrize("r", [0.05, 0.3, 0.8, 0.999, 1.001, 2.0])
+def test_energy_of_a_mixed_pair_is_the_work_of_its_repulsion(r):
+    """From r out to r_0, below the core too; nothing beyond r_0, without a step there."""
+    core = 0.2
+    net = js.Graph.from_edges(np.array([[1, 2]]), 3)
+    # The solid particle's partner is far away, but no pair: both hang on one spring.
+    fluid = js.Fluid(js.SlideLaw(1.0, 1.0), core=core, molten=js.Molten(net)).with_mass(jnp.asarray(1.0))
+    state = js.State.from_points(net, [[0.0, 0.0], [r, 0.0], [99.0, 0.0]])
+
+    def push(s):
+        return max(1 / max(s, core) ** 4 - 1 / max(s, core) ** 2, 0) * s
+
+    work = scipy.integrate.quad(push, r, 1.0, points=[core], epsabs=1e-12)[0] if r < 1 else 0.0
+    assert float(fluid.energy(state)) == pytest.approx(work, abs=1e-9)
+
+
+def test_what_is_solid_drags_counts_and_limits_nothing():
+    """Drag, its bound, overlaps and the step for collisions look at what is fluid; a fluid one and a solid one drag."""
+    net, system, state = scene(drag=js.PairDrag(0.5, 2.0), core=0.95)
+    speeds = np.array([[0.0, 0], [0, 0], [0, 0], [1, 0], [-9, 0]])
+    state = dataclasses.replace(state, velocity=js.State.from_points(net, state.points, speeds).velocity)
+    # Only particle 0 is fluid: beside it 1 stands still, and 2 and 3 are nearer to each other than the core.
+    at = with_springs(net, state, [0, 1, 1, 1])
+    fluid = system.prepare(state.dtype).forces[1]
+    still = at.moved(at.position, js.Vector.zeros_like(at.velocity))
+    np.testing.assert_allclose(force_of_fluid(system, at), force_of_fluid(system, still), atol=1e-15)
+    pulled = at.moved(at.position, js.State.from_points(net, state.points, speeds[[3, 0, 0, 0, 0]]).velocity)
+    r = np.hypot(0.9, 0.1)
+    # The distance of a pair nearer than the core is taken as the core's.
+    u, rate = np.array([-0.9, -0.1]) / 0.95, 0.5 * (1 - 0.95 / 2.0) ** 2
+    assert r < 0.95
+    drag = force_of_fluid(system, pulled) - force_of_fluid(system, still)
+    np.testing.assert_allclose(drag[1], rate * u[0] * u, rtol=1e-12)
+    np.testing.assert_allclose(drag[[0, 1]].sum(axis=0), 0, atol=1e-15)
+    np.testing.assert_array_equal(drag[2:], 0)
+    bound = np.asarray(fluid.damping_bound(at))
+    np.testing.assert_allclose(bound, [2 * rate, 2 * rate, 0, 0, 0], rtol=1e-12)
+    (overlaps,) = fluid.diagnose(at)
+    assert (overlaps.flag, int(overlaps.count), int(overlaps.node)) == (js.Flag.OVERLAP, 1, 0)
+    assert float(fluid.collision_dt(at)[0]) == np.inf
+    assert int(fluid.update(at, at, jnp.asarray(1.0))[1].flags) == 0
+
+
+def test_bound_of_stiffness_of_a_mixed_pair():
+    """Two particles, one fluid: twice the stiffness of the repulsion where it acts, zero beyond r_0."""
+    net = js.Graph.from_edges(np.array([[1, 2]]), 3)
+    fluid = js.Fluid(js.SlideLaw(1.0, 1.0), molten=js.Molten(net)).with_mass(jnp.asarray(1.0))
+    for r, k in ((0.8, 3 / 0.8**4 - 1 / 0.8**2), (1.5, 0.0)):
+        bound = fluid.stiffness_bound(js.State.from_points(net, [[0.0, 0.0], [r, 0.0], [99.0, 0.0]]))
+        np.testing.assert_allclose(net.flatten_nodes(bound), [2 * k, 2 * k, 0], rtol=1e-12)
 
 
 def test_no_pair_is_evaluated_before_something_melts():
@@ -130,6 +190,9 @@ class Endless(Cutoff):
         return law.potential(squared)
 
 
+LISTED = js.Fluid(js.SlideLaw(1.0, 1.0), js.PlainCutoff(2.0), js.NeighbourList(8, 0.1))
+
+
 @pytest.mark.parametrize(
     ("build", "message"),
     [
@@ -147,6 +210,14 @@ class Endless(Cutoff):
         (lambda: js.Fluid(js.SlideLaw(1.0, 1.0), Endless(), js.NeighbourList(8, 0.1)), "a neighbour list needs a law that ends"),
         (lambda: js.Fluid(js.SlideLaw(1.0, 1.0), js.PlainCutoff(0.9)), "the equilibrium distance = 1.0 m is beyond the cut-off"),
         (lambda: js.Fluid(js.SlideLaw(1.0, 1.0), js.PlainCutoff(2.0), core=3.0), "core = 3.0 m is beyond the cut-off"),
+        (
+            lambda: js.Fluid(js.SlideLaw(1.0, 1.0), js.PlainCutoff(2.0), js.NeighbourList(8, 0.1), js.PairDrag(1.0, 2.5)),
+            "drag.radius = 2.5 m is beyond the cut-off",
+        ),
+        (
+            lambda: js.System(js.lattice(2), 1.0, (LISTED, LISTED)).prepare(float),
+            "two fluids of this system have a NeighbourList",
+        ),
     ],
 )
 def test_refusals(build, message):

@@ -9,7 +9,7 @@ import pytest
 
 import jaxspring as js
 from jaxspring.forces.cells import find_neighbours
-from tests.particles import blob, components, make
+from tests.particles import blob, components, make, slide_force
 
 CAPACITY = 48
 find = jax.jit(lambda position, edge: find_neighbours(position, edge, CAPACITY))
@@ -52,16 +52,56 @@ def test_the_list_is_remade_when_it_must_and_no_pair_is_missed(rng):
 
 @pytest.mark.slow
 def test_a_step_beyond_the_skin_is_told(rng):
-    """A particle that goes farther than half the skin in one step raises DT_LIMIT: the list could not have known."""
+    """A particle that goes a little farther than half the skin in one step raises DT_LIMIT: the list could not have known."""
     system, state = make(
-        blob(rng, 8, spacing=3.0), velocities=np.full((8, 3), 9.0), cutoff=js.ShiftedForce(2.5), pairs=js.NeighbourList(8, 0.1)
+        blob(rng, 8, spacing=3.0), velocities=np.eye(8, 3) * 9.0, cutoff=js.ShiftedForce(2.5), pairs=js.NeighbourList(8, 0.1)
     )
     fluid = system.prepare(state.dtype).forces[0]
     begun = fluid.begin(state)
-    after = begun.moved(begun.position + 0.01 * begun.velocity, begun.velocity)
     update = jax.jit(lambda a, b: fluid.update(a, b, jnp.asarray(1e-6))[1].flags)
-    assert int(update(begun, after)) == int(js.Flag.DT_LIMIT)
-    assert int(update(begun, begun)) == 0
+    for share, flag in ((1.05, js.Flag.DT_LIMIT), (0.95, 0)):
+        after = begun.moved(begun.position + share * 0.05 / 9.0 * begun.velocity, begun.velocity)
+        assert int(update(begun, after)) == int(flag)
+
+
+@pytest.mark.slow
+def test_a_pair_that_meets_within_a_step_is_listed():
+    """Two particles farther apart than reach and skin come within reach in the middle of the second step, whose force must know them."""
+    points, skin = np.array([[0.0, 0.0], [2.5 + 1.05 * 0.4, 0.0]]), 0.4
+    ends = []
+    for pairs in (js.AllPairs(), js.NeighbourList(8, skin)):
+        # 0.3 skins in each step; so heavy that no collision limits the step.
+        speeds = np.array([[12.0, 0.0], [-12.0, 0.0]])
+        system, state = make(points, 100.0, velocities=speeds, cutoff=js.PlainCutoff(2.5), pairs=pairs)
+        ends.append(js.rollout(system, state, js.VelocityVerlet(), 0.01, 2))
+    assert int(ends[1].status.flags) == 0
+    assert float(ends[0].state.velocity.x[0]) > 12.1
+    np.testing.assert_allclose(ends[1].state.velocities, ends[0].state.velocities, rtol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("gap", [3.0, 5 * 3.0, 7 * 3.0, 64 * 3.0])
+def test_forces_wherever_particles_are(gap):
+    """Forty particles in a row, so far apart that only the last two meet: with a small list, too, their forces are those of all pairs."""
+    points = np.stack([gap * np.arange(40), np.zeros(40)], axis=1)
+    points[39] = points[38] + [1.2, 0.0]
+    for dim in (1, 2):
+        system, state = make(points[:, :dim], cutoff=js.PlainCutoff(2.5), pairs=js.NeighbourList(8, 0.5))
+        force = components(system.force(state))
+        np.testing.assert_allclose(force, slide_force(points[:, :dim], np.ones(40), reach=2.5), atol=1e-12)
+        assert np.abs(force[38:]).max() > 0.1
+
+
+@pytest.mark.slow
+def test_every_step_tells_an_overflow(rng):
+    """The step itself says NEIGHBOUR_OVERFLOW with the capacity that is needed, whatever the list holds when the run ends."""
+    system, state = make(blob(rng, 60, spacing=0.8), cutoff=js.ShiftedForce(2.5), pairs=js.NeighbourList(8, 0.3))
+    fluid = system.prepare(state.dtype).forces[0]
+    begun = fluid.begin(state)
+    status = jax.jit(lambda state: fluid.update(state, state, jnp.asarray(1e-6))[1])(begun)
+    assert int(status.flags) == int(js.Flag.NEIGHBOUR_OVERFLOW)
+    (count,) = (int(found.count) for found in fluid.diagnose(begun) if found.flag == js.Flag.NEIGHBOUR_OVERFLOW)
+    assert int(status.count) == count > 8
 
 
 @pytest.mark.slow

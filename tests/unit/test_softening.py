@@ -55,6 +55,14 @@ def test_expansion():
     np.testing.assert_allclose(squeezed.x, [-1.4, 0, 0, 0, 1.4], atol=1e-14)
 
 
+def test_expansion_stops_at_nothing():
+    """Cooled below -1 / a a rest length is zero, never less: the springs pull their ends together, and no further."""
+    springs = js.Springs(CHAIN, 7.0, 1.0, expansion=js.ThermalExpansion(2e-2, 300.0))
+    cold = warm(CHAIN, 200.0)
+    np.testing.assert_array_equal(CHAIN.flatten(springs.natural_length(cold)), 0)
+    np.testing.assert_allclose(springs.force(cold).x, [7, 0, 0, 0, -7], atol=1e-14)
+
+
 def test_springs_with_thermal_stiffness_have_an_energy():
     """Minus the gradient of the energy by position is the force, at any temperature."""
     import jax
@@ -97,6 +105,32 @@ def test_refreezing_takes_the_present_length():
     assert not CHAIN.flatten(far.alive).any()
 
 
+def test_refreezing_without_hysteresis():
+    """At the melting point itself a spring stays broken; a hair below it comes back."""
+    again = js.Refreezing(hysteresis=0.0, reach=2.0)
+    _, hot = fused([400.0] * 5, refreezing=again)
+    _, end = fused([350.0, 350.0, 350.0, 349.99, 349.99], refreezing=again, state=hot)
+    assert CHAIN.flatten(end.alive).tolist() == [False, False, True, True]
+
+
+def test_refreezing_under_expansion():
+    """What comes back while its material is cooler or warmer than the reference has no pull there, and the length of that temperature."""
+    springs = js.Springs(CHAIN, 10.0, 1.0, expansion=js.ThermalExpansion(2e-3, 400.0))
+    system = js.System(CHAIN, 1.0, springs, rules=js.Fusing(CHAIN, 350.0, js.Refreezing(20.0, 2.0)))
+    hot = js.rollout(system, warm(CHAIN, 400.0, 1.3), js.Still(), 0.1, 1).state
+    cold = js.rollout(system, dataclasses.replace(hot, temperature=jnp.full(5, 300.0)), js.Still(), 0.1, 1).state
+    assert CHAIN.flatten(cold.alive).all()
+    np.testing.assert_allclose(system.force(cold).x, 0, atol=1e-13)
+    np.testing.assert_allclose(CHAIN.flatten(cold.rest_length), 1.3 / 0.8, rtol=1e-14)
+
+
+def test_a_melting_point_that_slipped_in_is_reported():
+    """NaN put in after construction, by which nothing would ever melt, gives INVALID."""
+    rule = eqx.tree_at(lambda r: r.melting, js.Fusing(CHAIN, 350.0), jnp.asarray(jnp.nan))
+    state = rule.begin(warm(CHAIN, 400.0))
+    assert bool(rule.update(state, state, jnp.asarray(0.1))[1].has(js.Flag.INVALID))
+
+
 def test_broken_springs_by_where():
     """A broken spring with an infinite stiffness pulls by nothing, not by 0 times infinity."""
     springs = js.Springs(CHAIN, 10.0, 1.0)
@@ -104,6 +138,9 @@ def test_broken_springs_by_where():
     endless = eqx.tree_at(lambda s: s.stiffness, springs, jnp.asarray([10.0, jnp.inf, 10.0, 10.0]))
     state = dataclasses.replace(warm(CHAIN, None, 1.3), alive=CHAIN.split(jnp.asarray([True, False, True, True])))
     np.testing.assert_allclose(endless.force(state).x, [3, -3, 3, 0, -3], atol=1e-13)
+
+
+WHOLE_SHEET = js.EdgeField(tuple(jnp.ones(shape, bool) for shape in SHEET.family_shapes))
 
 
 @pytest.mark.parametrize(
@@ -117,6 +154,11 @@ def test_broken_springs_by_where():
         (lambda: js.Floor((0.0, 0.0), (0.0, 0.0)), "no length"),
         (lambda: js.Floor((0.0, 0.0), (0.0, 1.0), friction=-0.1), "friction"),
         (lambda: js.Floor((0.0, 0.0), (0.0, 1.0), restitution=1.5), "restitution"),
+        (
+            lambda: js.System(CHAIN, 1.0, rules=js.Fusing(CHAIN, 1.0, js.Refreezing(1.0, 1.0))).prepare(float),
+            "one Springs on the net of Fusing, whose rest lengths change; this system has 0",
+        ),
+        (lambda: js.Fusing(CHAIN, 1.0).begin(dataclasses.replace(warm(CHAIN, 1.0), alive=WHOLE_SHEET)), "of another net than Fusing"),
         (lambda: js.System(CHAIN, 1.0, rules=js.Fusing(CHAIN, 1.0)).begin(js.State.from_points(CHAIN, CHAIN.grid())), "from_points"),
     ],
 )
@@ -126,11 +168,11 @@ def test_refusals(make, match):
         make()
 
 
-def on_floor(velocity, friction=0.0, restitution=0.0):
-    """One node 0.1 m below the floor with this velocity, after the floor."""
+def on_floor(velocity, friction=0.0, restitution=0.0, height=-0.1):
+    """One node 0.1 m below the floor, or at this height, with this velocity, after the floor."""
     net = js.lattice(1)
     floor = js.Floor((0.0, 0.0), (0.0, 1.0), friction, restitution)
-    state = js.State.from_points(net, [[0.0, -0.1]], [velocity])
+    state = js.State.from_points(net, [[0.0, height]], [velocity])
     return floor.update(state, state, jnp.asarray(0.1))[0]
 
 
@@ -142,3 +184,28 @@ def test_floor():
     np.testing.assert_allclose(on_floor((3.0, -2.0), friction=0.4).velocities, [[3 - 0.4 * 2, 0]])
     np.testing.assert_allclose(on_floor((3.0, -2.0), friction=4.0).velocities, [[0, 0]], atol=1e-15)
     np.testing.assert_allclose(on_floor((3.0, 2.0), friction=4.0).velocities, [[3, 2]])
+    # What is thrown back presses more, and is braked more: by mu (1 + e) times the inward speed.
+    np.testing.assert_allclose(on_floor((3.0, -2.0), 0.4, 0.5).velocities, [[3 - 0.4 * 1.5 * 2, 1]])
+    # Above it nothing happens, however fast the node comes.
+    above = on_floor((3.0, -2.0), 0.4, 0.5, height=0.1)
+    assert (above.points.tolist(), above.velocities.tolist()) == ([[0, 0.1]], [[3, -2]])
+
+
+def test_floor_anywhere(rng):
+    """A plane in space that is not through the origin: x - ((x - p) . n) n for nodes below it, the inward part of the velocity gone."""
+    net, p, n = js.lattice(6), np.array([0.3, -2.0, 1.0]), np.array([1.0, 2.0, -2.0])
+    x, v, unit = rng.normal(size=(6, 3)) + p, rng.normal(size=(6, 3)), n / 3
+    state = js.State.from_points(net, x, v)
+    end, status = js.Floor(p, n).update(state, state, jnp.asarray(0.1))
+    height, inward = (x - p) @ unit, np.minimum(v @ unit, 0)
+    assert 0 < (height < 0).sum() < 6
+    np.testing.assert_allclose(end.points, x - np.minimum(height, 0)[:, None] * unit, atol=1e-14)
+    np.testing.assert_allclose(end.velocities, v - np.where(height < 0, inward, 0)[:, None] * unit, atol=1e-14)
+    assert int(status.flags) == 0
+
+
+def test_a_floor_does_not_run_backward():
+    """What a floor took is gone: a step back in time is INVALID."""
+    state = js.State.from_points(CHAIN, CHAIN.grid())
+    status = js.Floor((0.0,), (1.0,)).update(state, state, jnp.asarray(-0.1))[1]
+    assert bool(status.has(js.Flag.INVALID))

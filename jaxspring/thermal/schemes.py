@@ -51,7 +51,18 @@ class ExplicitHeat(HeatScheme):
         return 1 / rate
 
 
-class BackwardEulerHeat(HeatScheme):
+class _Solved(HeatScheme):
+    """What ends with a backward step by a linear solver."""
+
+    solver: LinearSolver
+    iteration: HeatIteration
+
+    def __init__(self, solver: LinearSolver | None = None, iteration: HeatIteration | None = None):
+        self.solver = JaxCG() if solver is None else solver
+        self.iteration = HeatIteration() if iteration is None else iteration
+
+
+class BackwardEulerHeat(_Solved):
     """Backward Euler: order 1, any dt, and no new extreme. One linear solve a step; with latent heat or radiation a few.
 
     Attributes:
@@ -59,32 +70,18 @@ class BackwardEulerHeat(HeatScheme):
         iteration: how far the iteration goes where the power is not linear.
     """
 
-    solver: LinearSolver
-    iteration: HeatIteration
-
-    def __init__(self, solver: LinearSolver | None = None, iteration: HeatIteration | None = None):
-        self.solver = JaxCG() if solver is None else solver
-        self.iteration = HeatIteration() if iteration is None else iteration
-
     def advance(self, flow: Flow, y: Array, dt: Array) -> tuple[Array, Status]:
         """One backward step."""
         return BackwardStep(self.solver, self.iteration).solve(flow.at(flow.state.time + dt), y, dt)
 
 
-class CrankNicolsonHeat(HeatScheme):
+class CrankNicolsonHeat(_Solved):
     """Crank and Nicolson's trapezoidal rule: order 2, any dt is stable. Jumps ring where dt is far above the explicit limit.
 
     Attributes:
         solver: `JaxCG()` unless said.
         iteration: how far the iteration goes where the power is not linear.
     """
-
-    solver: LinearSolver
-    iteration: HeatIteration
-
-    def __init__(self, solver: LinearSolver | None = None, iteration: HeatIteration | None = None):
-        self.solver = JaxCG() if solver is None else solver
-        self.iteration = HeatIteration() if iteration is None else iteration
 
     def advance(self, flow: Flow, y: Array, dt: Array) -> tuple[Array, Status]:
         """Half an explicit step, half a backward one."""

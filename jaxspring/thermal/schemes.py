@@ -25,7 +25,7 @@ from .flow import Flow
 
 
 class HeatScheme(eqx.Module):
-    """How heat is advanced. Abstract: `ExplicitHeat`, `BackwardEulerHeat`, `CrankNicolsonHeat` and `SplitHeat` are final."""
+    """How heat is advanced. Abstract: the final ones are in `schemes.py` and `split.py`."""
 
     @abc.abstractmethod
     def advance(self, flow: Flow, y: Array, dt: Array) -> tuple[Array, Status]:
@@ -44,7 +44,7 @@ class ExplicitHeat(HeatScheme):
 
     def advance(self, flow: Flow, y: Array, dt: Array) -> tuple[Array, Status]:
         """Y + dt P / C."""
-        return flow.at(flow.state.time + dt).hold(_pushed(flow, y, dt)), Status.ok()
+        return flow.at(flow.state.time + dt).hold(pushed(flow, y, dt)), Status.ok()
 
     def limit(self, rate: Array) -> Array:
         """1 / rate: a node then keeps a share of its own temperature, and no new extreme arises."""
@@ -86,11 +86,12 @@ class CrankNicolsonHeat(_Solved):
     def advance(self, flow: Flow, y: Array, dt: Array) -> tuple[Array, Status]:
         """Half an explicit step, half a backward one."""
         half = 0.5 * dt
-        return BackwardStep(self.solver, self.iteration).solve(flow.at(flow.state.time + dt), _pushed(flow, y, half), half)
+        return BackwardStep(self.solver, self.iteration).solve(flow.at(flow.state.time + dt), pushed(flow, y, half), half)
 
 
-def _pushed(flow: Flow, y: Array, dt: Array) -> Array:
+def pushed(flow: Flow, y: Array, dt: Array) -> Array:
+    """`y` after an explicit step of dt [s]."""
     return y + dt * flow.power(flow.temperature(y)) / flow.capacity
 
 
-__all__ = ["BackwardEulerHeat", "CrankNicolsonHeat", "ExplicitHeat", "HeatScheme"]
+__all__ = ["BackwardEulerHeat", "CrankNicolsonHeat", "ExplicitHeat", "HeatScheme", "pushed"]

@@ -76,6 +76,7 @@ def schemes(net: js.Lattice) -> dict[str, HeatScheme]:
     plain, grids = js.JaxCG(TOLERANCE), js.JaxCG(TOLERANCE, preconditioner=js.Multigrid(net))
     return {
         "SplitHeat": js.SplitHeat(),
+        "SymmetricSplitHeat": js.SymmetricSplitHeat(),
         "BackwardEulerHeat": js.BackwardEulerHeat(plain),
         "BackwardEulerHeat, Multigrid": js.BackwardEulerHeat(grids),
         "CrankNicolsonHeat": js.CrankNicolsonHeat(plain),

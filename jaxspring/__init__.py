@@ -91,7 +91,7 @@ _HOMES = {
     "thermal.latent": ("LatentHeat",),
     "thermal.ledger": ("Account", "Ledger", "energy_ledger"),
     "thermal.schemes": ("BackwardEulerHeat", "CrankNicolsonHeat", "ExplicitHeat", "HeatScheme"),
-    "thermal.split": ("SplitHeat",),
+    "thermal.split": ("SplitHeat", "SymmetricSplitHeat"),
     "thermal.stiffness": ("ThermalExpansion", "ThermalStiffness"),
     "inverse.fit": ("Fit", "History", "Iteration", "fit"),
     "inverse.iteration": ("GradientWarning",),

@@ -70,7 +70,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         return melt(arguments) if isinstance(arguments, MeltArguments) else run(arguments)
     except KeyboardInterrupt:
-        return complain("interrupted before the first iteration; nothing was written.", INTERRUPTED)
+        return complain("interrupted; no results were written.", INTERRUPTED)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
@@ -133,7 +133,7 @@ def melt(arguments: MeltArguments) -> int:
     except (OSError, ImportError, MemoryError) as error:
         return complain(str(error) or "there is not enough memory.", UNUSABLE)
     if outcome.is_interrupted:
-        return complain("interrupted; nothing was written.", INTERRUPTED)
+        return complain("interrupted; no results were written.", INTERRUPTED)
     if outcome.failure:
         return complain(outcome.failure, FAILED)
     print(outcome.table)

@@ -57,12 +57,8 @@ class NoCutoff(Cutoff):
         return law.potential(squared)
 
 
-class PlainCutoff(Cutoff):
-    """The law up to a radius, nothing beyond: the force jumps there, and energy is kept less well.
-
-    Attributes:
-        radius: [m].
-    """
+class _AtRadius(Cutoff):
+    """What ends at a radius."""
 
     radius: Array
 
@@ -73,6 +69,14 @@ class PlainCutoff(Cutoff):
     def reach(self) -> Array:
         """The radius [m]."""
         return self.radius
+
+
+class PlainCutoff(_AtRadius):
+    """The law up to a radius, nothing beyond: the force jumps there, and energy is kept less well.
+
+    Attributes:
+        radius: [m].
+    """
 
     def weight(self, law: PairLaw, squared: Array) -> Array:
         """W below the radius, zero from it on."""
@@ -83,7 +87,7 @@ class PlainCutoff(Cutoff):
         return _below(squared, self.radius, law.potential(squared) - law.potential(self.radius**2))
 
 
-class ShiftedForce(Cutoff):
+class ShiftedForce(_AtRadius):
     """The law less its force at the radius, so that the force ends at zero without a jump.
 
     The radius must lie beyond the distance at which the attraction is strongest, else no attraction is left: for the slides' law with
@@ -92,16 +96,6 @@ class ShiftedForce(Cutoff):
     Attributes:
         radius: [m].
     """
-
-    radius: Array
-
-    def __init__(self, radius: Any):
-        self.radius = _constant("radius", radius)
-
-    @property
-    def reach(self) -> Array:
-        """The radius [m]."""
-        return self.radius
 
     def weight(self, law: PairLaw, squared: Array) -> Array:
         """W - F(c) / r below the radius, zero from it on."""

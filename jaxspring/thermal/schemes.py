@@ -25,7 +25,7 @@ from .flow import Flow
 
 
 class HeatScheme(eqx.Module):
-    """How heat is advanced. Abstract: `ExplicitHeat`, `BackwardEulerHeat`, `CrankNicolsonHeat` and `SplitHeat` are final."""
+    """How heat is advanced. Abstract: the final ones are in `schemes.py` and `split.py`."""
 
     @abc.abstractmethod
     def advance(self, flow: Flow, y: Array, dt: Array) -> tuple[Array, Status]:
@@ -44,14 +44,25 @@ class ExplicitHeat(HeatScheme):
 
     def advance(self, flow: Flow, y: Array, dt: Array) -> tuple[Array, Status]:
         """Y + dt P / C."""
-        return flow.at(flow.state.time + dt).hold(_pushed(flow, y, dt)), Status.ok()
+        return flow.at(flow.state.time + dt).hold(pushed(flow, y, dt)), Status.ok()
 
     def limit(self, rate: Array) -> Array:
         """1 / rate: a node then keeps a share of its own temperature, and no new extreme arises."""
         return 1 / rate
 
 
-class BackwardEulerHeat(HeatScheme):
+class _Solved(HeatScheme):
+    """What ends with a backward step by a linear solver."""
+
+    solver: LinearSolver
+    iteration: HeatIteration
+
+    def __init__(self, solver: LinearSolver | None = None, iteration: HeatIteration | None = None):
+        self.solver = JaxCG() if solver is None else solver
+        self.iteration = HeatIteration() if iteration is None else iteration
+
+
+class BackwardEulerHeat(_Solved):
     """Backward Euler: order 1, any dt, and no new extreme. One linear solve a step; with latent heat or radiation a few.
 
     Attributes:
@@ -59,19 +70,12 @@ class BackwardEulerHeat(HeatScheme):
         iteration: how far the iteration goes where the power is not linear.
     """
 
-    solver: LinearSolver
-    iteration: HeatIteration
-
-    def __init__(self, solver: LinearSolver | None = None, iteration: HeatIteration | None = None):
-        self.solver = JaxCG() if solver is None else solver
-        self.iteration = HeatIteration() if iteration is None else iteration
-
     def advance(self, flow: Flow, y: Array, dt: Array) -> tuple[Array, Status]:
         """One backward step."""
         return BackwardStep(self.solver, self.iteration).solve(flow.at(flow.state.time + dt), y, dt)
 
 
-class CrankNicolsonHeat(HeatScheme):
+class CrankNicolsonHeat(_Solved):
     """Crank and Nicolson's trapezoidal rule: order 2, any dt is stable. Jumps ring where dt is far above the explicit limit.
 
     Attributes:
@@ -79,21 +83,15 @@ class CrankNicolsonHeat(HeatScheme):
         iteration: how far the iteration goes where the power is not linear.
     """
 
-    solver: LinearSolver
-    iteration: HeatIteration
-
-    def __init__(self, solver: LinearSolver | None = None, iteration: HeatIteration | None = None):
-        self.solver = JaxCG() if solver is None else solver
-        self.iteration = HeatIteration() if iteration is None else iteration
-
     def advance(self, flow: Flow, y: Array, dt: Array) -> tuple[Array, Status]:
         """Half an explicit step, half a backward one."""
         half = 0.5 * dt
-        return BackwardStep(self.solver, self.iteration).solve(flow.at(flow.state.time + dt), _pushed(flow, y, half), half)
+        return BackwardStep(self.solver, self.iteration).solve(flow.at(flow.state.time + dt), pushed(flow, y, half), half)
 
 
-def _pushed(flow: Flow, y: Array, dt: Array) -> Array:
+def pushed(flow: Flow, y: Array, dt: Array) -> Array:
+    """`y` after an explicit step of dt [s]."""
     return y + dt * flow.power(flow.temperature(y)) / flow.capacity
 
 
-__all__ = ["BackwardEulerHeat", "CrankNicolsonHeat", "ExplicitHeat", "HeatScheme"]
+__all__ = ["BackwardEulerHeat", "CrankNicolsonHeat", "ExplicitHeat", "HeatScheme", "pushed"]

@@ -137,7 +137,11 @@ def temperature_of(state: State, who: str) -> Array:
 def _share(z: Array, sharpness: Array | None) -> Array:
     if sharpness is None:
         return jnp.clip(z, 0, 1)
-    return (jax.nn.softplus(sharpness * z) - jax.nn.softplus(sharpness * (z - 1))) / sharpness
+    # The shares of z and 1 - z add up to 1. The smaller one is formed: the larger, a difference of large terms, would exceed 1 by rounding.
+    is_low = z < 0.5
+    near = jnp.where(is_low, z, 1 - z)
+    share = (jax.nn.softplus(sharpness * near) - jax.nn.softplus(sharpness * (near - 1))) / sharpness
+    return jnp.where(is_low, share, 1 - share)
 
 
 def _number(name: str, value: Any) -> Array:

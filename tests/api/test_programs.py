@@ -208,3 +208,36 @@ def test_no_heat_no_cost():
     """A state holds time, position and velocity, and nothing that the scene does not name."""
     state = js.State.from_points(CHAIN, np.zeros((N, 2)))
     assert len(jax.tree.leaves(eqx.filter(state, eqx.is_array))) == 5
+
+
+def warm_rollout(stiffness, temperature, *rules):
+    """Operations of a rollout's state alone, by these rules of temperature."""
+    system = js.System(CHAIN, 1.0, js.Springs(CHAIN, stiffness, np.ones(N - 1)), rules=rules)
+    state = js.State.from_points(CHAIN, np.zeros((N, 2)), temperature=temperature)
+    run = jax.jit(lambda system, state, dt: js.rollout(system, state, js.SymplecticEuler(), dt, 100).state)
+    return seen(run.lower(system, state, jnp.asarray(1e-2)))
+
+
+def test_each_rule_of_temperature_adds_its_own_operations():
+    """A temperature that no effect reads is computed with nowhere; softening adds a mean and a ramp, and only the smooth one exponentials;
+    fusing adds a mean, one comparison and one bit, and only refreezing measures lengths again. None adds a branch, a loop or a scatter.
+    """
+    k = np.full(N - 1, 10.0)
+    cold = warm_rollout(k, None)
+    assert warm_rollout(k, 300.0) == cold
+    soft = warm_rollout(js.ThermalStiffness(10.0, 300.0, 350.0), 300.0)
+    smooth = warm_rollout(js.ThermalStiffness(10.0, 300.0, 350.0, 20.0), 300.0)
+    fused = warm_rollout(k, 300.0, js.Fusing(CHAIN, 350.0))
+    again = warm_rollout(k, 300.0, js.Fusing(CHAIN, 350.0, js.Refreezing(10.0, 2.0)))
+    # The mean is a slice, an addition and a multiplication, and the ramp a difference, a division and two bounds. The full stiffness is
+    # brought to the extended range of springs, where it is zero, as every stiffness is.
+    ramp = Counter(subtract=2, divide=1, maximum=1, minimum=1)
+    assert soft - cold == ramp + Counter(slice=1, add=1, multiply=2, select=4)
+    assert (smooth - soft)["exponential"] == 2
+    # A broken spring's pull is not read, nor are those beyond the ends: two selections, and a bit that is padded and cut.
+    assert fused - cold == Counter(compare=1, slice=2, add=1, multiply=1, pad=1, select=2) + Counter({"and": 1})
+    assert again["sqrt"] == 1
+    assert cold["rsqrt"] == soft["rsqrt"] == fused["rsqrt"] == 1
+    for program in (soft, smooth, fused, again):
+        assert not {"case", "scatter", "gather", "sort"} & set(program)
+        assert program["while"] == cold["while"]

@@ -13,6 +13,7 @@ SCHEMES = [
     (js.BackwardEulerHeat(FINE, ITERATION), 1.0),
     (js.CrankNicolsonHeat(FINE, ITERATION), 0.3),
     (js.SplitHeat(ITERATION), 1.0),
+    (js.SymmetricSplitHeat(ITERATION), 0.3),
 ]
 NET = js.lattice((3, 4))
 START = np.array([300.0, 310, 320, 330, 305, 315, 325, 380, 352, 361, 370, 390])

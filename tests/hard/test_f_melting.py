@@ -28,7 +28,7 @@ class CutAt(Rule):
 
 @pytest.mark.slow
 def test_f6_cutting_at_any_step():
-    """F6: cut after step 1, 500 or the last: one compile, the same shapes, momentum continuous, each half's internal forces sum to 0."""
+    """F6: cut after 0, 1, 500 or all steps: one compile, the same shapes, momentum continuous, each half's internal forces sum to 0."""
     columns = np.broadcast_to(np.arange(6.0), (4, 6))
     hot = jnp.asarray(np.where((columns == 2) | (columns == 3), 400.0, 300.0) - np.where(columns == 2, 60.0, 0.0))
     cold = jnp.full((4, 6), 300.0)
@@ -36,21 +36,25 @@ def test_f6_cutting_at_any_step():
     traces = []
 
     @eqx.filter_jit
-    def run(step):
+    def run(step, alive):
         traces.append(0)
         rules = (CutAt(step, cold, hot), js.Fusing(NET, 369.0))
         system = js.System(NET, 1.0, js.Springs(NET, 50.0, NET.lengths(NET.grid())), rules=rules)
         start = js.State.from_points(NET, points, velocities=np.full((24, 2), 0.1), temperature=300.0)
+        start = dataclasses.replace(start, alive=NET.split(alive))
         return js.rollout(system, start, js.SymplecticEuler(), 2e-3, 1000).state, system
 
     left = jnp.asarray(columns <= 2)
-    for step in (1, 500, 1000):
-        end, system = run(jnp.asarray(float(step)))
-        cut = np.asarray(hot).ravel()[np.asarray(NET.edges)].mean(1) >= 369.0
-        crossing = np.asarray(NET.edges) % 6
-        assert cut[(crossing.min(1) == 2) & (crossing.max(1) == 3)].all()
+    cut = np.asarray(hot).ravel()[np.asarray(NET.edges)].mean(1) >= 369.0
+    crossing = np.asarray(NET.edges) % 6
+    assert cut[(crossing.min(1) == 2) & (crossing.max(1) == 3)].all()
+    for step in (0, 1, 500, 1000):
+        end, system = run(jnp.asarray(float(step)), jnp.asarray(~cut if step == 0 else np.ones_like(cut)))
         np.testing.assert_array_equal(~np.asarray(NET.flatten(end.alive)), cut)
         np.testing.assert_allclose(system.momentum(end), [2.4, 2.4], atol=1e-12)
+        # Halves that are apart from the start never pull at each other; else the one pulls the other for a step at least.
+        pulled = abs(float(jnp.sum(jnp.where(left, end.velocity.x, 0.0))) - 1.2)
+        assert pulled < 1e-12 if step == 0 else pulled > 1e-3
         for half in (left, ~left):
             for f in system.force(end):
                 assert abs(float(jnp.sum(jnp.where(half, f, 0.0)))) < 1e-12

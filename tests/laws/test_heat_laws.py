@@ -16,7 +16,7 @@ from jaxspring.thermal.phase import Equation, relaxed, searched
 
 NET = js.lattice((3, 4))
 GRAPH = js.Graph.from_edges(NET.edges[::-1], 12)
-IMPLICIT = [js.BackwardEulerHeat(), js.CrankNicolsonHeat(), js.SplitHeat()]
+IMPLICIT = [js.BackwardEulerHeat(), js.CrankNicolsonHeat(), js.SplitHeat(), js.SymmetricSplitHeat()]
 
 
 @eqx.filter_jit
@@ -55,7 +55,7 @@ def test_heat_is_kept(scheme, melts, seed, log_dt, log_latent, heated):
     status, end, (before, after), given_heat = run(scheme, NET, c, g, t, latent, q, jnp.asarray(10**log_dt))
     scale = float(before) + float(jnp.sum(jnp.abs(q))) * 5 * 10**log_dt
     # Half an explicit step of Crank-Nicolson moves up to dt G theta about, whose rounding is kept.
-    moved = 10**log_dt * 1e3 * 100 if isinstance(scheme, js.CrankNicolsonHeat) else 0.0
+    moved = 10**log_dt * 1e3 * 100 if isinstance(scheme, (js.CrankNicolsonHeat, js.SymmetricSplitHeat)) else 0.0
     assert abs(float(after - before - given_heat)) <= 1e-12 * (scale + moved)
     assert np.all(np.isfinite(end))
     if log_dt < 0:

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
+import scipy.linalg
 import scipy.special
 
 import jaxspring as js
@@ -15,6 +16,7 @@ SCHEMES = [
     (js.BackwardEulerHeat(FINE, ITERATION), 1),
     (js.CrankNicolsonHeat(FINE, ITERATION), 2),
     (js.SplitHeat(ITERATION), 1),
+    (js.SymmetricSplitHeat(ITERATION), 2),
 ]
 
 
@@ -57,6 +59,48 @@ def test_error_falls_as_dt_to_the_order(scheme, order):
     error = [np.abs(np.ravel(after(heat, t0, 0.5 / n, n).temperature) - exact).max() for n in (20, 40)]
     assert np.log2(error[0] / error[1]) == pytest.approx(order, abs=0.1)
     assert error[1] < 5.0
+
+
+@pytest.fixture(scope="module")
+def block():
+    """A block in space with random material, its temperatures and its dense matrix of rates, C^-1 K [1/s]."""
+    net, rng = js.lattice((4, 5, 3)), np.random.default_rng(1)
+    c, g, t0 = rng.uniform(1, 2, 60), rng.uniform(0.2, 2, net.n_springs), rng.uniform(300, 400, 60)
+    rows = np.zeros((net.n_springs, 60))
+    for row, (a, b) in zip(rows, net.edges, strict=True):
+        row[a], row[b] = 1, -1
+    return net, c, g, t0, rows.T @ np.diag(g) @ rows / c[:, None]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("scheme", "order"), [(js.SplitHeat(), 1), (js.SymmetricSplitHeat(), 2)], ids=lambda p: type(p).__name__)
+def test_axes_in_turn_have_their_order_in_space(block, scheme, order):
+    """Against the matrix exponential of a block: halving dt divides the error by 2**order, and heat is kept to rounding."""
+    net, c, g, t0, rates = block
+    exact, error = scipy.linalg.expm(-rates) @ t0, []
+    for n in (16, 32):
+        end = after(js.Heat(net, c, g, scheme), t0, jnp.asarray(1 / n), n).temperature
+        error.append(np.abs(np.ravel(end) - exact).max())
+        assert float(np.sum(c * np.ravel(end))) == pytest.approx(np.sum(c * t0), rel=1e-14)
+    assert np.log2(error[0] / error[1]) == pytest.approx(order, abs=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dt", [1.0, 1e2, 1e4])
+def test_the_symmetric_split_is_stable_in_space(block, dt):
+    """The distance from the mean, weighed with the capacities, shrinks in every one of 100 steps of any length."""
+    net, c, g, t0, _ = block
+    start = js.State.from_points(net, net.grid(), temperature=t0)
+    system = js.System(net, 1.0, rules=js.Heat(net, c, g, js.SymmetricSplitHeat()))
+    seen = every_temperature(system, start, jnp.asarray(dt))
+    distance = np.sqrt((c * (np.vstack([t0, seen]) - np.sum(c * t0) / np.sum(c)) ** 2).sum(1))
+    assert np.all((np.diff(distance) < 0) | (distance[1:] < 1e-9))
+
+
+@eqx.filter_jit
+def every_temperature(system, start, dt):
+    """(100, N) temperatures after each of 100 steps."""
+    return js.rollout(system, start, js.Still(), dt, 100, save_every=1, observe=lambda state: state.temperatures).saved
 
 
 @pytest.mark.slow

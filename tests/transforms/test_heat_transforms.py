@@ -23,7 +23,9 @@ def end(scheme, conductivity, melting, wall, traces=None):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scheme", [js.ExplicitHeat(), js.BackwardEulerHeat(), js.SplitHeat()], ids=lambda s: type(s).__name__)
+@pytest.mark.parametrize(
+    "scheme", [js.ExplicitHeat(), js.BackwardEulerHeat(), js.SplitHeat(), js.SymmetricSplitHeat()], ids=lambda s: type(s).__name__
+)
 def test_traced_once_and_batched(scheme):
     """Three sets of constants share one program, and a batch of them gives what they give one by one, to 1e-6 of a kelvin."""
     traces = Traces()

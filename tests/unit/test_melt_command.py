@@ -2,11 +2,16 @@
 
 import json
 import math
+import signal
 
+import jax
+import numpy as np
 import pytest
 
+import jaxspring as js
+from jaxspring import cli
 from jaxspring.cli import main
-from jaxspring.scenes.melting.scene import MeltSettings
+from jaxspring.scenes.melting.scene import MeltSettings, melting_block
 
 
 @pytest.mark.parametrize(
@@ -43,10 +48,13 @@ def test_bad_settings_are_named(field, value):
 
 
 @pytest.mark.slow
-def test_a_small_block(tmp_path, capsys):
-    """A small block gives the whole folder; nothing is below the floor, the ledger closes, and the lowest layer melts."""
+def test_a_small_block(tmp_path, capsys, monkeypatch):
+    """A small block gives the whole folder; nothing is below the floor, the ledger closes, and the lowest layer melts. Interrupted runs
+    leave it as it is.
+    """
     out = tmp_path / "out"
-    assert main(["melt", "--nodes", "3x3x3", "--duration", "0.15", "--out", str(out)]) == 0
+    run = ["melt", "--nodes", "3x3x3", "--duration", "0.15", "--out", str(out)]
+    assert main(run) == 0
     assert sorted(path.name for path in out.iterdir()) == ["melting.gif", "report.json", "strip.png"]
     report = json.loads((out / "report.json").read_text())
     assert report["lowest_particle_m"] >= 0
@@ -58,3 +66,54 @@ def test_a_small_block(tmp_path, capsys):
     assert share[-1] >= 1 / 3
     assert set(report["seconds"]) >= {"run", "Springs", "Fluid", "Heat", "Fusing", "Floor"}
     assert "melted" in capsys.readouterr().out
+    check_interrupts(run, out, capsys, monkeypatch)
+
+
+def check_interrupts(run, out, capsys, monkeypatch):
+    """Ctrl-C in the middle of a run, or while pictures are drawn, ends with code 130 and one line; the older result stays as it was."""
+    older = {path: path.read_bytes() for path in out.iterdir()}
+
+    def interrupted_in(module, name, is_time):
+        usual = getattr(module, name)
+
+        def interrupt(*given, **named):
+            if is_time(*given):
+                signal.raise_signal(signal.SIGINT)
+            return usual(*given, **named)
+
+        monkeypatch.setattr(module, name, interrupt)
+        assert main(run) == cli.INTERRUPTED
+        monkeypatch.setattr(module, name, usual)
+        assert capsys.readouterr().err.splitlines()[-1] == "jaxspring: interrupted; no results were written."
+        assert list(out.parent.iterdir()) == [out]
+        assert {path: path.read_bytes() for path in out.iterdir()} == older
+
+    interrupted_in(js.progress, "draw_bar", lambda label, done, total: done >= total / 2)
+    interrupted_in(js.scenes.melting.job, "draw_strip", lambda *_: True)
+
+
+@pytest.mark.slow
+def test_an_interrupted_block_goes_on():
+    """A run that Ctrl-C ended while the block was melting goes on to the state of the unbroken run, its book of energy included."""
+    settings = MeltSettings(nodes=(3, 3, 3))
+    scene = melting_block(settings)
+
+    def run(state, n_steps, callback=None, resume=None):
+        # Blocks of one length, so that all of these runs are pieces of one program.
+        block, progress = js.Checkpointed(block=24), js.Progress(callback=callback, bar=False)
+        return js.rollout(scene.system, state, js.SymplecticEuler(), 4e-4, n_steps, adjoint=block, progress=progress, resume=resume)
+
+    def stop(done, total):
+        if done >= total / 2:
+            signal.raise_signal(signal.SIGINT)
+
+    whole, broken = run(scene.state, 600), run(scene.state, 600, stop)
+    assert bool(broken.status.has(js.Flag.INTERRUPTED))
+    done = int(broken.info.n_steps)
+    assert 300 <= done < 350
+    assert 0 < js.melted_fraction(scene.net, broken.state) < js.melted_fraction(scene.net, whole.state)
+    rest = run(broken.state, 600 - done, resume=broken.resume)
+    js.raise_for_status(rest)
+    for a, b in zip(jax.tree.leaves(rest.state), jax.tree.leaves(whole.state), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert js.energy_ledger(scene.system, rest.state) == js.energy_ledger(scene.system, whole.state)

@@ -164,6 +164,47 @@ def test_no_pair_is_evaluated_before_something_melts():
     np.testing.assert_allclose(lanes.x[1], force(melted).x, rtol=1e-14)
 
 
+class CountedPairs(js.AllPairs):
+    """Every pair, telling the host each time they are gone through, for whatever term."""
+
+    def sum(self, *arguments):
+        """As every pair."""
+        jax.debug.callback(lambda: CALLS.append(1))
+        return super().sum(*arguments)
+
+
+@pytest.mark.slow
+def test_a_run_goes_through_no_pairs_before_something_melts():
+    """A whole run with its limits, statuses and book of energy: no pass while every spring holds, also in a batch of runs; at least one
+    pass a step from when one particle of one run is free.
+    """
+    net = js.lattice(5)
+    fluid = js.Fluid(js.gentle_fluid(1.0), pairs=CountedPairs(), molten=js.Molten(net))
+    rules = js.Ledger((js.Heat(net, 1.0, 1.0), js.Fusing(net, 350.0)))
+    system = js.System(net, 1.0, (js.Springs(net, 10.0, 1.0), fluid), rules=rules)
+
+    def run(temperature):
+        start = js.State.from_points(net, 1.02 * net.grid(), temperature=temperature)
+        result = js.rollout(system, start, js.SymplecticEuler(), 0.01, 12)
+        return js.melted_fraction(net, result.state), result.status.flags
+
+    def passes(function, temperature):
+        CALLS.clear()
+        melted, flags = jax.block_until_ready(function(jnp.asarray(temperature)))
+        jax.effects_barrier()
+        assert not np.any(flags)
+        return len(CALLS), np.asarray(melted).tolist()
+
+    single, batch = jax.jit(run), jax.jit(jax.vmap(run))
+    cold, hot = np.full(5, 300.0), np.array([900.0, 300.0, 300.0, 300.0, 300.0])
+    assert passes(single, cold) == (0, 0)
+    assert passes(batch, [cold, cold]) == (0, [0, 0])
+    assert passes(single, hot)[0] >= 12
+    count, melted = passes(batch, [cold, hot])
+    assert count >= 12
+    assert melted[0] == 0 < melted[1]
+
+
 def test_any_lane_is_one_value_for_all_lanes():
     """Under vmap, and vmap of vmap, the flag is true where any lane's is, and has no batch axis; without vmap it is itself."""
     flags = jnp.array([[False, False], [False, True]])

@@ -152,7 +152,8 @@ def _solve(
     import diffrax
 
     ready = system.prepare(state.dtype)
-    start = ready.constrain(state)
+    # A list of neighbours is kept up to date by rollout alone: without one each evaluation makes its own.
+    start = ready.constrain(dataclasses.replace(state, neighbours=None))
     before = begin(system, ready, Carry(start, None, jnp.zeros((), jnp.int32)), jnp.zeros((), state.dtype), None)
     end = diffrax.SubSaveAt(t1=True)
     solution = diffrax.diffeqsolve(

@@ -144,10 +144,11 @@ class Fluid(Force):
         return findings if needed is None else (Finding(Flag.NEIGHBOUR_OVERFLOW, needed, nowhere), *findings)
 
     def begin(self, state: State) -> State:
-        """The state with the list that its pairs reuse, where it has none."""
-        if state.neighbours is not None:
-            return state
-        return replace(state, neighbours=self.pairs.begin(stopped(self._flat(state)), self.cutoff.reach))
+        """The state with the list that its pairs reuse: its own where it serves, else a new one."""
+        position, reach = stopped(self._flat(state)), self.cutoff.reach
+        if state.neighbours is None:
+            return replace(state, neighbours=self.pairs.begin(position, reach))
+        return replace(state, neighbours=self.pairs.keep(state.neighbours, position, reach))
 
     def update(self, before: State, state: State, dt: Array) -> tuple[State, Status]:
         """The list brought up to date, and DT_LIMIT where dt is too long for two of the fastest particles that meet head-on."""
@@ -196,9 +197,7 @@ class Fluid(Force):
             fluid=None if fluid is None else jnp.ravel(fluid).astype(state.dtype),
             velocity=tuple(jnp.ravel(a) for a in state.velocity) if with_velocity else (),
         )
-        memory = state.neighbours
-        if memory is None:
-            memory = self.pairs.begin(stopped(particles.position), self.cutoff.reach)
+        memory = self.pairs.ready(state.neighbours, stopped(particles.position), self.cutoff.reach)
 
         def summed(operands: tuple[Particles, PairTerms, Any]) -> Fields:
             particles, terms, memory = operands

@@ -1,13 +1,14 @@
 """Neighbour lists: the pairs within the cut-off and a skin, found now and then, and reused in between.
 
-    listed      pairs nearer than reach + skin
-    rebuilt     when a particle may, after one more step like the last, have moved skin / 2 since the list was made
+    listed      pairs nearer than edge = reach + skin
+    rebuilt     when a particle may, after one more step twice as long as the last, have moved skin / 2 since the list was made
+    trusted     while no particle has moved (edge - reach) / 2: no pair can then be within reach unlisted
 
-So no pair comes within reach unlisted. The list is made inside `jit`, under a conditional on the device. Derivatives pass through the
-positions, not through the list: a pair that enters or leaves it has no force there.
+Every sum looks whether the list can be trusted, so that no pair is ever left out: one that is too small (NEIGHBOUR_OVERFLOW tells the
+capacity that is needed), or was made for other positions or a shorter reach, is not used, and the sum runs over all pairs, right but slow.
 
-A list too small for its pairs is never cut: NEIGHBOUR_OVERFLOW tells the capacity that is needed, and until then the sums run over all
-pairs, right but slow.
+The list is made inside `jit`, under a conditional on the device. Derivatives pass through the positions, not through the list: a pair that
+enters or leaves it has no force there.
 """
 
 from __future__ import annotations
@@ -39,12 +40,32 @@ class NeighbourMemory(eqx.Module):
     Attributes:
         near: who is near whom.
         reference: D arrays (N,) of positions [m] when it was made.
+        edge: distance [m] below which pairs are listed.
         rebuilds: how often it was made anew.
     """
 
     near: Neighbourhood
     reference: Fields
+    edge: Array
     rebuilds: Array
+
+    def serves(self, position: Fields, reach: Array) -> Array:
+        """Whether every pair nearer than `reach` [m] at these positions is sure to be listed, room allowing."""
+        return 2 * _farthest(self.reference, position) <= self.edge - reach.astype(self.edge.dtype)
+
+
+class TrustedList(eqx.Module):
+    """A list as a sum takes it.
+
+    Attributes:
+        near: who is near whom.
+        is_trusted: whether it holds every pair within reach.
+        dim: number of coordinates (static).
+    """
+
+    near: Neighbourhood
+    is_trusted: Array
+    dim: int = eqx.field(static=True)
 
 
 class NeighbourList(Pairs):
@@ -72,40 +93,66 @@ class NeighbourList(Pairs):
 
     def begin(self, position: Fields, reach: Array | None) -> NeighbourMemory:
         """A list for these positions."""
-        return NeighbourMemory(self._find(position, reach), position, jnp.zeros((), jnp.int32))
+        return self._made(position, reach, jnp.zeros((), jnp.int32))
+
+    def keep(self, memory: NeighbourMemory, position: Fields, reach: Array | None) -> NeighbourMemory:
+        """The list where it serves these positions, else a new one."""
+        fresh = jax.eval_shape(lambda: self.begin(position, reach))
+        if jax.tree.structure(fresh) != jax.tree.structure(memory) or any(
+            a.shape != b.shape or a.dtype != b.dtype for a, b in zip(jax.tree.leaves(fresh), jax.tree.leaves(memory), strict=True)
+        ):
+            return self.begin(position, reach)
+        is_good = (memory.edge == self._edge(position, reach)) & memory.serves(position, _given(reach))
+        return lax.cond(any_lane(~is_good), lambda _: self.begin(position, reach), lambda memory: memory, memory)
 
     def update(self, memory: NeighbourMemory, before: Fields, position: Fields, reach: Array | None) -> tuple[NeighbourMemory, Status]:
         """The list as it is, or made anew where a particle has moved far; DT_LIMIT where one step went farther than half the skin."""
         step, moved = _farthest(before, position), _farthest(memory.reference, position)
-        is_stale = any_lane(step + moved > self.skin / 2)
+        is_stale = any_lane(2 * step + moved > self.skin / 2)
 
         def anew(memory: NeighbourMemory) -> NeighbourMemory:
-            return NeighbourMemory(self._find(position, reach), position, memory.rebuilds + 1)
+            return self._made(position, reach, memory.rebuilds + 1)
 
         fresh = lax.cond(is_stale, anew, lambda memory: memory, memory)
         needed = fresh.near.needed
         status = Status.when(Flag.NEIGHBOUR_OVERFLOW, needed > self.capacity, count=needed)
         return fresh, status.then(Status.when(Flag.DT_LIMIT, step > self.skin / 2))
 
-    def needed(self, memory: NeighbourMemory) -> Array:
+    def needed(self, memory: NeighbourMemory | None) -> Array:
         """Capacity needed where the list is too small, else 0."""
-        return jnp.where(memory.near.needed > self.capacity, memory.near.needed, 0)
+        if memory is None:
+            return jnp.zeros((), jnp.int32)
+        return jnp.where(memory.near.needed > memory.near.table.shape[0], memory.near.needed, 0)
 
-    def visit(self, function: PairFunction, fields: Fields, memory: NeighbourMemory) -> Fields:
-        """Sum over the listed pairs; over all pairs where the list is too small."""
+    def ready(self, memory: NeighbourMemory | None, position: Fields, reach: Array | None) -> TrustedList:
+        """The list, and whether it can be trusted at these positions; a new one where there is none."""
+        memory = self.begin(position, reach) if memory is None else memory
+        is_trusted = memory.serves(position, _given(reach)) & (self.needed(memory) == 0)
+        return TrustedList(memory.near, is_trusted, len(position))
+
+    def visit(self, function: PairFunction, fields: Fields, memory: TrustedList) -> Fields:
+        """Sum over the listed pairs; over all pairs where the list cannot be trusted."""
         return lax.cond(
-            any_lane(memory.near.needed > self.capacity),
+            any_lane(~memory.is_trusted),
             lambda fields, near: AllPairs().visit(function, fields),
-            lambda fields, near: _sum_listed(function, fields, near, len(memory.reference)),
+            lambda fields, near: _sum_listed(function, fields, near, memory.dim),
             fields,
             memory.near,
         )
 
-    def _find(self, position: Fields, reach: Array | None) -> Neighbourhood:
-        if reach is None:
-            raise ValueError("a neighbour list needs a law with a cut-off.")
+    def _made(self, position: Fields, reach: Array | None, rebuilds: Array) -> NeighbourMemory:
+        edge = self._edge(position, reach)
+        return NeighbourMemory(find_neighbours(position, edge, self.capacity), position, edge, rebuilds)
+
+    def _edge(self, position: Fields, reach: Array | None) -> Array:
         dtype = position[0].dtype
-        return find_neighbours(position, reach.astype(dtype) + self.skin.astype(dtype), self.capacity)
+        return lax.stop_gradient(_given(reach).astype(dtype) + self.skin.astype(dtype))
+
+
+def _given(reach: Array | None) -> Array:
+    if reach is None:
+        raise ValueError("a neighbour list needs a law with a cut-off.")
+    return lax.stop_gradient(reach)
 
 
 def _sum_listed(function: PairFunction, fields: Fields, near: Neighbourhood, dim: int) -> Fields:

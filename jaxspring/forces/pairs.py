@@ -36,7 +36,7 @@ class Pairs(eqx.Module):
             function: see `visit`; it must close over no traced value.
             terms: what it needs besides: a pytree that may be differentiated by.
             fields: what the particles have.
-            memory: what `begin` and `update` gave.
+            memory: what `ready` gave.
             sign: 1 where exchanging the two particles leaves the values, -1 where it turns their sign, None where it does neither.
         """
         arrays, static = eqx.partition(terms, eqx.is_array)
@@ -59,6 +59,14 @@ class Pairs(eqx.Module):
     def begin(self, position: tuple[Array, ...], reach: Array | None) -> Any:
         """What is remembered between steps, made from the positions; None where nothing is."""
         return None
+
+    def keep(self, memory: Any, position: tuple[Array, ...], reach: Array | None) -> Any:
+        """The memory at the start of another run: as it is where it serves these positions, else new."""
+        return memory
+
+    def ready(self, memory: Any, position: tuple[Array, ...], reach: Array | None) -> Any:
+        """The memory as `visit` takes it, at these positions; `memory` is None in a state that has not begun."""
+        return memory
 
     def update(self, memory: Any, before: tuple[Array, ...], position: tuple[Array, ...], reach: Array | None) -> tuple[Any, Status]:
         """The memory after a step from `before` to `position`."""

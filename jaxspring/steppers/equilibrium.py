@@ -12,6 +12,7 @@ Source: Steihaug (1983) for the truncated iteration; Conn, Gould and Toint, Trus
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from typing import Any
@@ -276,7 +277,8 @@ def _push(system: System, like: Vector) -> Vector:
 @eqx.filter_jit
 def _find(search: _Search, system: System, state: State) -> Equilibrium:
     ready = system.prepare(state.dtype)
-    start = ready.constrain(state)
+    # A list of neighbours is kept up to date by rollout alone: without one each evaluation makes its own.
+    start = ready.constrain(dataclasses.replace(state, neighbours=None))
     # Free nodes end at the same place wherever they start; only held ones carry a derivative.
     anchor = ready.matrix(Blocks(), start).pick(stopped(start.position), start.position)
     scene = _Scene(ready, start.moved(anchor, Vector.zeros_like(anchor)))

@@ -9,7 +9,7 @@ import pytest
 
 import jaxspring as js
 from jaxspring.forces.cells import find_neighbours
-from tests.particles import blob, components, make, slide_force
+from tests.particles import blob, components, free_net, make, slide_force
 
 CAPACITY = 48
 find = jax.jit(lambda position, edge: find_neighbours(position, edge, CAPACITY))
@@ -126,3 +126,94 @@ def test_a_batch_of_fluids_is_each_alone(rng):
         alone, state = make(points[lane], law=js.SlideLaw(alpha[lane], 1.0, 0.1), cutoff=js.ShiftedForce(2.5))
         ours = np.stack([a[lane] for a in lanes], axis=-1)
         np.testing.assert_allclose(ours, components(alone.force(state)), rtol=1e-11, atol=1e-11)
+
+
+def crystal(rng, cutoff=2.5, capacity=60):
+    """A Lennard-Jones system with a list, and points on a lattice."""
+    grid = np.stack(np.meshgrid(*[np.arange(4) * 1.2] * 3), axis=-1).reshape(-1, 3) + rng.normal(0, 0.03, (64, 3))
+    law, reach = js.LennardJones(1.0, 1.0), js.PlainCutoff(cutoff)
+    return make(grid, law=law, cutoff=reach, pairs=js.NeighbourList(capacity, 0.3))
+
+
+def moved_points(state, points):
+    """The state with other positions, its list as it was."""
+    return state.moved(js.State.from_points(free_net(len(points)), points).position, state.velocity)
+
+
+@pytest.mark.slow
+def test_a_list_of_other_positions_is_not_used(rng):
+    """Forces and energy of a state moved by hand are those of a fresh one; a run from there makes a new list."""
+    system, state = crystal(rng)
+    begun = js.rollout(system, state, js.VelocityVerlet(), 1e-3, 2).state
+    fresh = js.State.from_points(free_net(64), rng.permutation(state.points), state.velocities)
+    moved = moved_points(begun, fresh.points)
+    np.testing.assert_allclose(components(system.force(moved)), components(system.force(fresh)), atol=1e-11)
+    np.testing.assert_allclose(system.energy(moved).potential[0], system.energy(fresh).potential[0], rtol=1e-12)
+    fresh = fresh.moved(fresh.position, moved.velocity)
+    ends = [js.rollout(system, start, js.VelocityVerlet(), 1e-3, 5) for start in (moved, fresh)]
+    np.testing.assert_allclose(ends[0].state.points, ends[1].state.points, atol=1e-12)
+    assert int(ends[0].state.neighbours.rebuilds) == int(ends[1].state.neighbours.rebuilds)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("cutoff", "capacity"), [(3.0, 60), (2.0, 60), (2.5, 64)])
+def test_going_on_with_another_cut_off_or_capacity(cutoff, capacity, rng):
+    """A state with a list goes on under another reach or capacity as one without."""
+    system, state = crystal(rng)
+    begun = js.rollout(system, state, js.VelocityVerlet(), 1e-3, 2).state
+    other, _ = crystal(rng, cutoff, capacity)
+    fresh = js.State.from_points(free_net(64), begun.points, begun.velocities)
+    np.testing.assert_allclose(components(other.force(begun)), components(other.force(fresh)), atol=1e-11)
+    ends = [js.rollout(other, start, js.VelocityVerlet(), 1e-3, 5) for start in (begun, fresh)]
+    np.testing.assert_allclose(ends[0].state.points, ends[1].state.points, atol=1e-12)
+
+
+def test_a_list_that_serves_is_kept(rng):
+    """Two runs in a row make no list between them."""
+    system, state = crystal(rng)
+    first = js.rollout(system, state, js.VelocityVerlet(), 1e-3, 2).state
+    second = js.rollout(system, first, js.VelocityVerlet(), 1e-3, 2).state
+    np.testing.assert_array_equal(second.neighbours.reference, state.position.components)
+
+
+@pytest.mark.slow
+def test_a_pair_pushed_together_within_a_step(rng):
+    """Two particles that a load brings within reach in one step: as with all pairs, though the step before was too short to tell."""
+    ends = []
+    for pairs in (js.AllPairs(), js.NeighbourList(4, 0.3)):
+        points = np.array([[0.0, 0.0], [2.8001, 0.0]])
+        system, state = make(points, law=js.LennardJones(1.0, 1.0), cutoff=js.PlainCutoff(2.5), pairs=pairs)
+        push = js.Load.from_points(system.net, [[0.04, 0.0], [-0.04, 0.0]])
+        system = js.System(system.net, 1.0, (*system.forces, push))
+        ends.append(js.rollout(system, state, js.VelocityVerlet(), 1.0, 3).state.velocities)
+    np.testing.assert_allclose(ends[1], ends[0], rtol=1e-12)
+    assert abs(ends[0][0, 0]) > 0.13  # 0.12 without the attraction
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("n_steps", [0, 1])
+def test_solvers_of_diffrax_with_a_list(n_steps):
+    """Two particles that meet: as with all pairs, from a state with a list and from one without."""
+    ends = []
+    for pairs in (js.AllPairs(), js.NeighbourList(4, 0.3)):
+        system, state = make(
+            np.array([[-3.0, 0.0], [3.0, 0.2]]),
+            law=js.LennardJones(1.0, 1.0),
+            velocities=np.array([[1.0, 0.0], [-1.0, 0.0]]),
+            cutoff=js.PlainCutoff(2.5),
+            pairs=pairs,
+        )
+        start = state if n_steps == 0 else js.rollout(system, state, js.VelocityVerlet(), 0.005, n_steps).state
+        ends.append(js.diffeqsolve(system, start, t1=6.0).state.points)
+    np.testing.assert_allclose(ends[1], ends[0], rtol=1e-9)
+    assert abs(ends[0][0, 1]) > 0.1  # they turned each other
+
+
+@pytest.mark.slow
+def test_equilibrium_with_a_list(rng):
+    """A drop at rest feels no force, whether or not the state had a list."""
+    system, state = crystal(rng, cutoff=2.5)
+    begun = js.rollout(system, state, js.VelocityVerlet(), 1e-3, 2).state
+    rest = js.equilibrium(system, moved_points(begun, 1.1 * begun.points))
+    fresh = js.State.from_points(free_net(64), rest.state.points)
+    assert np.abs(components(system.force(fresh))).max() < 1e-6

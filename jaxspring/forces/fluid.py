@@ -153,10 +153,20 @@ class Fluid(Force):
     def update(self, before: State, state: State, dt: Array) -> tuple[State, Status]:
         """The list brought up to date, and DT_LIMIT where dt is too long for two of the fastest particles that meet head-on."""
         before, still, dt = stopped((before, state, dt))
-        memory, status = self.pairs.update(still.neighbours, self._flat(before), self._flat(still), self.cutoff.reach)
+        memory, status = self._listed(before, still)
         limit, node = self.collision_dt(still)
         too_long = Status.when(Flag.DT_LIMIT, jnp.abs(dt) > limit, node=node)
         return replace(state, neighbours=memory), status.then(too_long)
+
+    def _listed(self, before: State, state: State) -> tuple[Any, Status]:
+        """The list after a step; left as it is while nothing is fluid."""
+
+        def updated() -> tuple[Any, Status]:
+            return self.pairs.update(state.neighbours, self._flat(before), self._flat(state), self.cutoff.reach)
+
+        if self.molten is None or state.neighbours is None:
+            return updated()
+        return lax.cond(any_lane(jnp.any(self.molten.is_fluid(state))), updated, lambda: (state.neighbours, Status.ok()))
 
     def collision_dt(self, state: State) -> tuple[Array, Array]:
         """Largest dt [s] at which every particle could meet one as fast head-on, and the flat index of the particle that sets it.

@@ -265,3 +265,22 @@ def test_refusals(build, message):
     """What cannot be is refused when it is built, by name."""
     with pytest.raises(ValueError, match=message):
         build()
+
+
+@pytest.mark.slow
+def test_a_list_rests_until_something_melts():
+    """A flying chain that is cut on its way: its list is not remade before the cut, and the ends are those of all pairs."""
+    net, found = js.lattice(5), []
+    for pairs in (js.AllPairs(), js.NeighbourList(8, 0.2)):
+        fluid = js.Fluid(js.gentle_fluid(1.0), js.ShiftedForce(2.5), pairs, molten=js.Molten(net))
+        fusing = js.Fusing(net, 350.0)
+        system = js.System(net, 1.0, (js.Springs(net, 10.0, 1.0), fluid), rules=fusing)
+        points = 1.02 * np.arange(5.0)[:, None] * [[1.0, 0.0]]
+        start = js.State.from_points(net, points, np.full((5, 2), 2.0), temperature=300.0)
+        cold = js.rollout(system, start, js.SymplecticEuler(), 0.01, 40).state
+        hot = dataclasses.replace(cold, temperature=jnp.asarray([400.0, 400.0, 400.0, 300.0, 300.0]))
+        found.append((cold, js.rollout(system, hot, js.SymplecticEuler(), 0.01, 40).state))
+    (_, everyone), (cold, listed) = found
+    assert int(cold.neighbours.rebuilds) == 0
+    assert int(listed.neighbours.rebuilds) > 0
+    np.testing.assert_allclose(listed.points, everyone.points, rtol=1e-13)

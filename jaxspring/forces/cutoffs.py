@@ -20,6 +20,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._checks import is_concrete
+from .base import any_not_positive
 from .pair_laws import PairLaw, _constant
 
 
@@ -38,6 +39,10 @@ class Cutoff(eqx.Module):
     @abc.abstractmethod
     def potential(self, law: PairLaw, squared: Array) -> Array:
         """The law's potential, cut off."""
+
+    def invalid(self) -> Array | None:
+        """Whether a constant has a value that the constructor would refuse."""
+        return None
 
 
 class NoCutoff(Cutoff):
@@ -69,6 +74,10 @@ class _AtRadius(Cutoff):
     def reach(self) -> Array:
         """The radius [m]."""
         return self.radius
+
+    def invalid(self) -> Array:
+        """Whether the radius is not positive or not finite."""
+        return any_not_positive(self.radius)
 
 
 class PlainCutoff(_AtRadius):
@@ -144,6 +153,10 @@ class Switched(Cutoff):
         s = self._fraction(jnp.sqrt(squared))
         switch = 1 - s * s * s * (10 - s * (15 - 6 * s))
         return _below(squared, self.off, (law.potential(squared) - law.potential(self.off**2)) * switch)
+
+    def invalid(self) -> Array:
+        """Whether a radius is not positive or not finite, or `on` is not below `off`."""
+        return any_not_positive(self.on, self.off) | ~(self.on < self.off)
 
     def _fraction(self, r: Array) -> Array:
         one = jnp.ones((), r.dtype)

@@ -25,7 +25,7 @@ from ..state import State
 from ..status import Flag, Status
 from ..topology.base import Topology
 from ..vector import Vector
-from .base import Finding, Force
+from .base import Finding, Force, any_not_positive
 from .cutoffs import Cutoff, NoCutoff
 from .molten import Molten
 from .pair_drag import PairDrag
@@ -171,6 +171,24 @@ class Fluid(Force):
         node = jnp.argmax(jnp.ravel(squared)).astype(jnp.int32)
         return 2 * lax.rsqrt(jnp.max(squared)), node
 
+    def invalid(self) -> Array:
+        """Whether a constant of law, cut-off, list, drag or core is one that its constructor refuses, or does not fit within the reach."""
+        bad = any_not_positive(self.core)
+        for by_part in (part.invalid() for part in (self.law, self.cutoff, self.pairs, self.drag) if part is not None):
+            bad = bad if by_part is None else bad | by_part
+        reach = self.cutoff.reach
+        if reach is not None:
+            for distance in self._within_reach().values():
+                bad = bad | _is_beyond(distance, reach)
+        return bad
+
+    def _within_reach(self) -> dict[str, Array]:
+        """Distances [m] that must not be beyond the cut-off."""
+        inner = {"core": self.core, "the equilibrium distance": self.law.equilibrium_distance}
+        if self.drag is not None and self.pairs.needs_reach:
+            inner["drag.radius"] = self.drag.radius
+        return inner
+
     def _check(self) -> None:
         reach = self.cutoff.reach
         if reach is None:
@@ -179,11 +197,8 @@ class Fluid(Force):
                     "a neighbour list needs a law that ends. Pass cutoff=PlainCutoff(r), ShiftedForce(r) or Switched(on, off)."
                 )
             return
-        inner = {"core": self.core, "the equilibrium distance": self.law.equilibrium_distance}
-        if self.drag is not None and self.pairs.needs_reach:
-            inner["drag.radius"] = self.drag.radius
-        for name, value in inner.items():
-            if is_concrete(value) and is_concrete(reach) and bool(value > reach.astype(value.dtype)):
+        for name, value in self._within_reach().items():
+            if is_concrete(value) and is_concrete(reach) and bool(_is_beyond(value, reach)):
                 raise ValueError(f"{name} = {value} m is beyond the cut-off, {reach} m. Unchecked, pairs between the two would be dropped.")
 
     def _sum(self, state: State, term: Callable[..., Fields], n: int, with_velocity: bool = False) -> Fields:
@@ -219,3 +234,9 @@ class Fluid(Force):
         if self.mass is None:
             raise ValueError("Fluid has no masses yet. Put it in a System and ask that, or the forces of system.prepare(state.dtype).")
         return jnp.broadcast_to(self.mass.astype(state.dtype), state.position.shape)
+
+
+def _is_beyond(distance: Array, reach: Array) -> Array:
+    """Whether a distance is beyond the reach; a cut-off at the distance itself is not, whatever its rounding."""
+    coarser = max(float(jnp.finfo(value.dtype).eps) for value in (distance, reach))
+    return distance > reach.astype(distance.dtype) * (1 + 8 * coarser)

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._checks import as_inexact, has_shape, nonnegative
+from .base import any_not_positive, any_refused
 from .pair_laws import _constant
 
 
@@ -40,3 +41,7 @@ class PairDrag(eqx.Module):
         """C(r) [N s/m] of a squared distance [m^2]."""
         near = jnp.maximum(1 - jnp.sqrt(squared) / self.radius, jnp.zeros((), squared.dtype))
         return self.damping * near * near
+
+    def invalid(self) -> Array:
+        """Whether eta is negative, or R not positive, or one of them not finite."""
+        return any_refused(self.damping) | any_not_positive(self.radius)

@@ -22,6 +22,7 @@ from jax import lax
 from jaxtyping import Array
 
 from .._checks import as_inexact, finite, has_shape, nonnegative, positive
+from .base import any_not_positive, any_refused
 
 # Newton's steps for an equilibrium without closed form: the function is concave and rising, so that it converges from the left for all.
 N_NEWTON = 60
@@ -65,6 +66,10 @@ class PairLaw(eqx.Module):
         """k_0 per q_i q_j, the stiffness at the equilibrium distance; a pair swings at sqrt(q_i q_j k_0 (1/m_i + 1/m_j)) [rad/s]."""
         return self.stiffness(self.equilibrium_distance)
 
+    def invalid(self) -> Array | None:
+        """Whether a constant has a value that the constructor would refuse."""
+        return None
+
 
 class _PowerPair(PairLaw):
     """What the slides' law and its unit-vector form share."""
@@ -105,6 +110,10 @@ class _PowerPair(PairLaw):
         # The root is found without derivative; one more step brings the exact derivative in.
         root = lax.stop_gradient(lax.fori_loop(0, N_NEWTON, step, target / (self.b - self.a)))
         return jnp.exp(step(None, root))
+
+    def invalid(self) -> Array:
+        """Whether alpha or beta is not positive, or zeta negative, or one of them not finite."""
+        return any_not_positive(self.alpha, self.beta) | any_refused(self.zeta)
 
 
 class SlideLaw(_PowerPair):
@@ -221,6 +230,10 @@ class LennardJones(PairLaw):
         """4 epsilon 156 (sigma/r)**14 / sigma**2 where 4 epsilon (sigma/r)**12 is the energy [N/m]."""
         ratio = jnp.minimum((energy / (4 * self.epsilon)) ** (1 / 12), self.sigma / core)
         return 624 * self.epsilon * lax.integer_pow(ratio, 14) / (self.sigma * self.sigma)
+
+    def invalid(self) -> Array:
+        """Whether epsilon or sigma is not positive or not finite."""
+        return any_not_positive(self.epsilon, self.sigma)
 
 
 def gentle_fluid(spacing: Any, zeta: Any = 0.0, alpha: Any = 1.0) -> SlideLaw:

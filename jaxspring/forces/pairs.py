@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..status import Status
+from .base import any_not_positive
 from .pair_sums import Fields, summed
 
 # (own fields, other's fields, whether the two are two; None: all are) -> values, all arrays that broadcast against each other.
@@ -67,6 +68,10 @@ class Pairs(eqx.Module):
     def needed(self, memory: Any) -> Array | None:
         """Capacity that the memory would need where it is too small, else 0; None where nothing is remembered."""
         return None
+
+    def invalid(self) -> Array | None:
+        """Whether an array of it (a length, unless a subclass says otherwise) is not positive or not finite."""
+        return any_not_positive(eqx.filter(self, eqx.is_array))
 
 
 class AllPairs(Pairs):

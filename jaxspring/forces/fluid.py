@@ -27,7 +27,7 @@ from ..topology.base import Topology
 from ..vector import Vector
 from .base import Finding, Force, any_not_positive
 from .cutoffs import Cutoff, NoCutoff
-from .molten import Molten
+from .molten import Molten, check_springs
 from .pair_drag import PairDrag
 from .pair_laws import PairLaw, _constant
 from .pair_terms import Fields, PairTerms, Particles
@@ -104,8 +104,10 @@ class Fluid(Force):
         """The same; refuses a second list, for which a state has no place.
 
         Raises:
-            ValueError: two fluids with neighbour lists in one system.
+            ValueError: two fluids with neighbour lists in one system, or springs that are not on the net of `molten`.
         """
+        if self.molten is not None:
+            check_springs("Molten", self.molten.net, forces)
         if self.pairs.needs_reach and sum(isinstance(f, Fluid) and f.pairs.needs_reach for f in forces) > 1:
             raise ValueError("two fluids of this system have a NeighbourList, but a state keeps one list. Give one of them AllPairs().")
         return self

@@ -61,6 +61,20 @@ def test_melted_fraction():
         assert float(js.melted_fraction(net, with_springs(net, state, alive))) == share
 
 
+def test_molten_of_another_net_than_the_springs():
+    """A fluid, and a share that has melted, on a net whose springs are not those that break are refused with both nets."""
+    bare, sheared = js.lattice((3, 3)), js.lattice((3, 3), js.STRUCTURAL + js.SHEAR)
+    state = js.State.from_points(sheared, sheared.grid())
+    fluid = js.Fluid(js.gentle_fluid(1.0), molten=js.Molten(bare))
+    system = js.System(sheared, 1.0, (js.Springs(sheared, 1.0, 1.0), fluid))
+    both = r"Molten has a Lattice of 12 springs .* Springs of this system have a Lattice of 20 springs"
+    with pytest.raises(ValueError, match=both):
+        system.force(state)
+    whole = js.EdgeField(tuple(jnp.ones(shape, bool) for shape in sheared.family_shapes))
+    with pytest.raises(ValueError, match=r"state.alive tells about springs .* Lattice of 12 springs"):
+        js.melted_fraction(bare, dataclasses.replace(state, alive=whole))
+
+
 @pytest.mark.parametrize("pairs", [js.AllPairs(), js.AllPairs(2), js.NeighbourList(8, 0.5)], ids=["all", "tiles", "list"])
 def test_mixed_pairs_repel_only(pairs):
     """Two fluid particles have the whole law, a fluid and a solid one its repulsion, two solid ones nothing; pair by pair in NumPy."""

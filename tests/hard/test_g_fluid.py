@@ -89,6 +89,33 @@ def test_g5_head_on(rng):
         assert int(status.step) == 1
 
 
+@pytest.mark.parametrize(
+    ("dt", "points", "speed", "text"),
+    [
+        # stable_dt is infinite: no pair is within the cut-off.
+        (0.02, [[0.0, 0.0], [9.0, 0.0]], 50.0, "particles moved or met too fast for dt = 0.02 s.*Lower dt, or widen the skin"),
+        (0.5, [[0.0, 0.0], [1.2, 0.0]], 0.0, r"dt = 0\.5 s, but this run is surely stable only up to 0\.\d+ s"),
+    ],
+)
+def test_g5_the_warning_names_the_limit_that_was_passed(dt, points, speed, text):
+    """A dt above stable_dt is told with it; below it the warning speaks of the particles, and of no limit that dt keeps."""
+    options = {"law": js.LennardJones(1.0, 1.0), "cutoff": js.PlainCutoff(2.5), "pairs": js.NeighbourList(4, 0.3)}
+    system, state = make(np.array(points), velocities=np.array([[speed, 0.0], [0.0, 0.0]]), **options)
+    with pytest.warns(js.StabilityWarning, match=f"DT_LIMIT: .*{text}") as told:
+        js.rollout(system, state, js.SymplecticEuler(), dt, 1)
+    assert "inf s" not in str(told[0].message)
+
+
+def test_g5_an_error_names_no_infinite_limit():
+    """Where nothing limits dt, an error does not say that the limit was infinite."""
+    fast = np.array([[1e307, 0.0], [0.0, 0.0]])
+    system, state = make(np.array([[0.0, 0.0], [9.0, 0.0]]), law=js.LennardJones(1.0, 1.0), cutoff=js.PlainCutoff(2.5), velocities=fast)
+    result = jax.jit(lambda dt: js.rollout(system, state, js.SymplecticEuler(), dt, 1))(100.0)
+    with pytest.raises(js.SimulationError) as told:
+        js.raise_for_status(result)
+    assert "inf" not in str(told.value).replace("infin", "")
+
+
 def test_g6_what_a_cutoff_leaves_out(rng):
     """In a box of 20^3 the force on an off-centre particle is wrong by about 100 % at c = 2 and 4, by over 60 % at 8, under 40 % at 16."""
     points = np.concatenate([[[4.0, 10.0, 10.0]], rng.uniform(0, 20, (4000, 3))])

@@ -19,9 +19,12 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._checks import is_concrete
+from .._checks import constant, is_concrete
 from .base import any_not_positive
-from .pair_laws import PairLaw, _constant
+from .pair_laws import PairLaw
+
+# Why a radius of a switch is refused.
+NOTHING_LEFT = "A switch fades between two distances above zero."
 
 
 class Cutoff(eqx.Module):
@@ -68,7 +71,7 @@ class _AtRadius(Cutoff):
     radius: Array
 
     def __init__(self, radius: Any):
-        self.radius = _constant("radius", radius)
+        self.radius = constant("radius", radius, "No pair would be within it.")
 
     @property
     def reach(self) -> Array:
@@ -130,7 +133,7 @@ class Switched(Cutoff):
     off: Array
 
     def __init__(self, on: Any, off: Any):
-        self.on, self.off = _constant("on", on), _constant("off", off)
+        self.on, self.off = constant("on", on, NOTHING_LEFT), constant("off", off, NOTHING_LEFT)
         if is_concrete(self.on) and is_concrete(self.off) and not bool(self.on < self.off):
             raise ValueError(f"on = {self.on} is not below off = {self.off}: the force would be switched off before it begins to fade.")
 

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from .._checks import is_concrete
+from .._checks import constant, is_concrete, kind
 from ..numerics import any_lane, stopped
 from ..state import State
 from ..status import Flag, Status
@@ -29,7 +29,7 @@ from .base import Finding, Force, any_not_positive
 from .cutoffs import Cutoff, NoCutoff
 from .molten import Molten, check_springs
 from .pair_drag import PairDrag
-from .pair_laws import PairLaw, _constant
+from .pair_laws import PairLaw
 from .pair_terms import Fields, PairTerms, Particles
 from .pairs import AllPairs, Pairs
 
@@ -51,6 +51,7 @@ class Fluid(Force):
         mass: [kg]; `System` fills it in.
 
     Raises:
+        TypeError: a law, cut-off, pairs, drag or molten of another kind.
         ValueError: a list without a cut-off, a core or a drag that does not fit inside it.
 
     >>> net = js.Graph.from_edges(np.zeros((0, 2), int), 2)
@@ -77,12 +78,13 @@ class Fluid(Force):
         core: Any = None,
         molten: Molten | None = None,
     ):
-        self.law = law
-        self.cutoff = NoCutoff() if cutoff is None else cutoff
-        self.pairs = AllPairs() if pairs is None else pairs
-        self.drag = drag
-        self.core = CORE_FRACTION * law.equilibrium_distance if core is None else _constant("core", core)
-        self.molten = molten
+        self.law = kind("law", law, PairLaw, "SlideLaw(alpha=1.0, beta=1.0)")
+        self.cutoff = NoCutoff() if cutoff is None else kind("cutoff", cutoff, Cutoff, "ShiftedForce(2.5)")
+        self.pairs = AllPairs() if pairs is None else kind("pairs", pairs, Pairs, "NeighbourList(capacity=96, skin=0.3)")
+        self.drag = None if drag is None else kind("drag", drag, PairDrag, "PairDrag(damping=1.0, radius=1.5)")
+        why = "Two particles at one place would have an infinite force."
+        self.core = CORE_FRACTION * law.equilibrium_distance if core is None else constant("core", core, why)
+        self.molten = None if molten is None else kind("molten", molten, Molten, "Molten(net)")
         self.mass = None
         self._check()
 

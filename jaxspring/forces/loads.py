@@ -69,12 +69,23 @@ class Load(Force):
     Attributes:
         value: `Vector` in node shape [N], or a function of time [s] that returns one.
 
+    Raises:
+        TypeError: anything else, e.g. an array.
+
     >>> import jax.numpy as jnp
     >>> from jaxspring.topology.lattice import lattice
     >>> push = Load.from_points(lattice(2), [[0.0, 0.0], [1.0, 0.0]])
     """
 
     value: Vector | Callable[[Array], Vector]
+
+    def __init__(self, value: Vector | Callable[[Array], Vector]):
+        if not isinstance(value, Vector) and not callable(value):
+            raise TypeError(
+                f"value is a {type(value).__name__}; expected a Vector in node shape, or a function of time that returns one. "
+                f"For an (N, D) array in the order of the nodes use Load.from_points(net, forces)."
+            )
+        self.value = value
 
     @staticmethod
     def from_points(net: Topology, forces: Any) -> Load:

@@ -21,11 +21,14 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from .._checks import as_inexact, finite, has_shape, nonnegative, positive
+from .._checks import constant
 from .base import any_not_positive, any_refused
 
 # Newton's steps for an equilibrium without closed form: the function is concave and rising, so that it converges from the left for all.
 N_NEWTON = 60
+# Why a constant is refused.
+NO_REST = "Pairs would have no distance of equilibrium."
+SINGULAR = "The attraction would be singular at a distance above zero."
 
 
 class PairLaw(eqx.Module):
@@ -81,9 +84,9 @@ class _PowerPair(PairLaw):
     b: int = eqx.field(static=True)
 
     def __init__(self, alpha: Any, beta: Any, zeta: Any = 0.0, a: int = 2, b: int = 4):
-        self.alpha = _constant("alpha", alpha)
-        self.beta = _constant("beta", beta)
-        self.zeta = _constant("zeta", zeta, may_be_zero=True)
+        self.alpha = constant("alpha", alpha, NO_REST)
+        self.beta = constant("beta", beta, NO_REST)
+        self.zeta = constant("zeta", zeta, SINGULAR, may_be_zero=True)
         if not (isinstance(a, int) and isinstance(b, int) and 1 <= a < b and b >= 3):
             why = "The repulsion must rise faster than the attraction."
             raise ValueError(f"a = {a!r}, b = {b!r}; expected whole numbers, 1 <= a < b and b >= 3. {why}")
@@ -202,8 +205,8 @@ class LennardJones(PairLaw):
     sigma: Array
 
     def __init__(self, epsilon: Any, sigma: Any):
-        self.epsilon = _constant("epsilon", epsilon)
-        self.sigma = _constant("sigma", sigma)
+        self.epsilon = constant("epsilon", epsilon, NO_REST)
+        self.sigma = constant("sigma", sigma, NO_REST)
 
     @property
     def uses_mass(self) -> bool:
@@ -249,7 +252,8 @@ def gentle_fluid(spacing: Any, zeta: Any = 0.0, alpha: Any = 1.0) -> SlideLaw:
     >>> round(float(gentle_fluid(spacing=0.5, zeta=0.1).equilibrium_distance), 6)
     0.5
     """
-    h, zeta, alpha = _constant("spacing", spacing), _constant("zeta", zeta, may_be_zero=True), _constant("alpha", alpha)
+    h = constant("spacing", spacing, "Particles of a lattice are apart.")
+    zeta, alpha = constant("zeta", zeta, SINGULAR, may_be_zero=True), constant("alpha", alpha, NO_REST)
     return SlideLaw(alpha, alpha * lax.integer_pow(h, 4) / lax.integer_pow(h + zeta, 2), zeta)
 
 
@@ -261,14 +265,3 @@ def _rising(shifted: Array, zeta: Array, a: int) -> Array:
         return jnp.log(shifted) + zeta / shifted
     inverse = 1 / shifted
     return zeta * lax.integer_pow(inverse, a - 1) / (a - 1) - lax.integer_pow(inverse, a - 2) / (a - 2)
-
-
-def _constant(name: str, value: Any, may_be_zero: bool = False) -> Array:
-    value = as_inexact(name, value)
-    has_shape(name, value, {"one number": ()})
-    finite(name, value)
-    if may_be_zero:
-        nonnegative(name, value, "The attraction would be singular at a distance above zero.")
-    else:
-        positive(name, value, "Pairs would have no distance of equilibrium.")
-    return value

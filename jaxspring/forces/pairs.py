@@ -14,6 +14,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from ..status import Status
@@ -84,9 +85,9 @@ class AllPairs(Pairs):
     tile: int | None = eqx.field(static=True)
 
     def __init__(self, tile: int | None = None):
-        if tile is not None and (not isinstance(tile, int) or isinstance(tile, bool) or tile < 1):
+        if tile is not None and (not isinstance(tile, (int, np.integer)) or isinstance(tile, bool) or tile < 1):
             raise ValueError(f"tile = {tile!r}; expected a whole number of rows, 1 or more, or None.")
-        self.tile = tile
+        self.tile = None if tile is None else int(tile)
 
     def visit(self, function: PairFunction, fields: Fields, memory: Any = None) -> Fields:
         """Sum over all others, a tile of rows at a time."""

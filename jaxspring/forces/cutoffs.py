@@ -91,11 +91,11 @@ class PlainCutoff(_AtRadius):
     """
 
     def weight(self, law: PairLaw, squared: Array) -> Array:
-        """W below the radius, zero from it on."""
+        """The law's w below the radius, zero from it on."""
         return _below(squared, self.radius, law.weight(squared))
 
     def potential(self, law: PairLaw, squared: Array) -> Array:
-        """U - U(c) below the radius, zero from it on."""
+        """The law's U - U(c) below the radius, zero from it on."""
         return _below(squared, self.radius, law.potential(squared) - law.potential(self.radius**2))
 
 
@@ -110,12 +110,12 @@ class ShiftedForce(_AtRadius):
     """
 
     def weight(self, law: PairLaw, squared: Array) -> Array:
-        """W - F(c) / r below the radius, zero from it on."""
+        """The law's w - F(c) / r below the radius, zero from it on."""
         end = law.weight(self.radius**2) * self.radius
         return _below(squared, self.radius, law.weight(squared) - end * jnp.sqrt(1 / squared))
 
     def potential(self, law: PairLaw, squared: Array) -> Array:
-        """U - U(c) + F(c) (r - c) below the radius, zero from it on."""
+        """The law's U - U(c) + F(c) (r - c) below the radius, zero from it on."""
         end = law.weight(self.radius**2) * self.radius
         shifted = law.potential(squared) - law.potential(self.radius**2) + end * (jnp.sqrt(squared) - self.radius)
         return _below(squared, self.radius, shifted)
@@ -143,7 +143,7 @@ class Switched(Cutoff):
         return self.off
 
     def weight(self, law: PairLaw, squared: Array) -> Array:
-        """W S - (U - U(c)) S' / r below `off`, zero from it on."""
+        """Faded weight: w S - (U - U(c)) S' / r below `off`, zero from it on."""
         r = jnp.sqrt(squared)
         s = self._fraction(r)
         switch = 1 - s * s * s * (10 - s * (15 - 6 * s))
@@ -152,7 +152,7 @@ class Switched(Cutoff):
         return _below(squared, self.off, law.weight(squared) * switch - cut * slope / r)
 
     def potential(self, law: PairLaw, squared: Array) -> Array:
-        """(U - U(c)) S below `off`, zero from it on."""
+        """Faded potential: (U - U(c)) S below `off`, zero from it on."""
         s = self._fraction(jnp.sqrt(squared))
         switch = 1 - s * s * s * (10 - s * (15 - 6 * s))
         return _below(squared, self.off, (law.potential(squared) - law.potential(self.off**2)) * switch)

@@ -40,7 +40,7 @@ class Gravity(Force):
         return self if self.mass is not None else Gravity(self.acceleration, mass)
 
     def force(self, state: State) -> Vector:
-        """M g [N]."""
+        """Weight m g [N]."""
         return Vector(tuple(self._weight(g, a) for g, a in zip(self._acceleration(state), state.position, strict=True)))
 
     def energy(self, state: State) -> Array:

@@ -35,7 +35,7 @@ class PairDrag(eqx.Module):
         self.radius = constant("radius", radius, "No pair would be within it: pass drag=None for no drag.")
 
     def rate(self, squared: Array) -> Array:
-        """C(r) [N s/m] of a squared distance [m^2]."""
+        """Coefficient c(r) [N s/m] of a squared distance [m^2]."""
         near = jnp.maximum(1 - jnp.sqrt(squared) / self.radius, jnp.zeros((), squared.dtype))
         return self.damping * near * near
 

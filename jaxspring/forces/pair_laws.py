@@ -44,7 +44,7 @@ class PairLaw(eqx.Module):
 
     @abc.abstractmethod
     def weight(self, squared: Array) -> Array:
-        """W of a squared distance [m^2], above zero: the force on i is q_i q_j w (x_i - x_j)."""
+        """Weight w of a squared distance [m^2], above zero: the force on i is q_i q_j w (x_i - x_j)."""
 
     @abc.abstractmethod
     def potential(self, squared: Array) -> Array:
@@ -151,7 +151,7 @@ class SlideLaw(_PowerPair):
         return self.alpha * _rising(r + self.zeta, self.zeta, self.a) + self.beta * lax.integer_pow(1 / r, self.b - 2) / (self.b - 2)
 
     def turning_stiffness(self, energy: Array, core: Array) -> Array:
-        """(b - 1) beta / r**b where beta / ((b - 2) r**(b-2)) is the energy."""
+        """Repulsion's (b - 1) beta / r**b where beta / ((b - 2) r**(b-2)) is the energy."""
         inverse = jnp.minimum(((self.b - 2) * energy / self.beta) ** (1 / (self.b - 2)), 1 / core)
         return (self.b - 1) * self.beta * lax.integer_pow(inverse, self.b)
 
@@ -184,7 +184,7 @@ class UnitVectorLaw(_PowerPair):
         return self.alpha * far + self.beta * lax.integer_pow(1 / r, self.b - 1) / (self.b - 1)
 
     def turning_stiffness(self, energy: Array, core: Array) -> Array:
-        """B beta / r**(b+1) where beta / ((b - 1) r**(b-1)) is the energy."""
+        """Repulsion's b beta / r**(b+1) where beta / ((b - 1) r**(b-1)) is the energy."""
         inverse = jnp.minimum(((self.b - 1) * energy / self.beta) ** (1 / (self.b - 1)), 1 / core)
         return self.b * self.beta * lax.integer_pow(inverse, self.b + 1)
 

@@ -151,7 +151,7 @@ def main() -> None:
     settings = {"reach": REACH, "skin": SKIN, "density": DENSITY, "capacity": CAPACITY, "dt": DT}
     write("fluid", settings, {"forces": forces, "steps": steps, "others": others})
     panels = [
-        Panel(title, "million pairs a second", curves(rows))
+        Panel(title, "million pairs a second", curves(rows), xlabel="particles")
         for title, rows in (("forces, the list ready", forces), ("full steps, lists remade", steps))
     ]
     draw(panels, RESULTS / "fluid.png")

@@ -124,13 +124,14 @@ def show(title: str, rows: list[dict[str, Any]]) -> None:
 
 @dataclass
 class Panel:
-    """One diagram of a picture: curves over the number of nodes.
+    """One diagram of a picture: curves over the number of nodes, or of what `xlabel` says.
 
     Attributes:
         title, ylabel: what it shows.
         curves: label and style -> (nodes, values).
         log: whether values have a logarithmic axis; else it starts at zero.
         bound: a value to be stayed below, drawn as a line.
+        xlabel: what the curves run over.
     """
 
     title: str
@@ -138,6 +139,7 @@ class Panel:
     curves: dict[tuple[str, str], tuple[list[float], list[float]]]
     log: bool = False
     bound: float | None = None
+    xlabel: str = "nodes"
 
 
 def draw(panels: list[Panel], path: Path) -> None:
@@ -150,9 +152,10 @@ def draw(panels: list[Panel], path: Path) -> None:
             axes.plot(nodes, values, style, label=label)
         if panel.bound is not None:
             axes.axhline(panel.bound, color="0.6", linestyle="--", label=f"bound: {panel.bound:g}")
-        axes.set(title=panel.title, xlabel="nodes", ylabel=panel.ylabel, xscale="log")
+        axes.set(title=panel.title, xlabel=panel.xlabel, ylabel=panel.ylabel, xscale="log")
         axes.set(yscale="log") if panel.log else axes.set(ylim=(0, None))
-        axes.legend(fontsize=8)
+        # Below the diagram, where it hides no curve.
+        axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2)
         axes.grid(alpha=0.3)
     figure.savefig(path, dpi=150)
 

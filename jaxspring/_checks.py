@@ -81,6 +81,28 @@ def _sign(name: str, value: Any, why: str, *, strict: bool) -> None:
         raise ValueError(f"{name}{where} = {shown}, but must be {expected}. {why} Fix {name}{where}.")
 
 
+def constant(name: str, value: Any, why: str, may_be_zero: bool = False) -> Array:
+    """`value` as one finite number above zero, or zero where that is allowed; `why` says what a wrong sign would do.
+
+    Raises:
+        TypeError: not a real number.
+        ValueError: an array, not finite, or of the wrong sign.
+    """
+    value = as_inexact(name, value)
+    has_shape(name, value, {"one number": ()})
+    _sign(name, value, why, strict=not may_be_zero)
+    return value
+
+
+def kind(name: str, value: Any, expected: type, example: str) -> Any:
+    """`value`, an object of the class `expected`; else TypeError, with an example of what to pass."""
+    if isinstance(value, type):
+        raise TypeError(f"{name} is the class {value.__name__}; expected a {expected.__name__}. Make one: {example}.")
+    if not isinstance(value, expected):
+        raise TypeError(f"{name} is {value!r:.60}, a {type(value).__name__}; expected a {expected.__name__}, e.g. {example}.")
+    return value
+
+
 def has_shape(name: str, value: Any, allowed: dict[str, tuple[int, ...]]) -> None:
     """Raise ValueError unless the shape of `value` is one of `allowed` (a table of meaning -> shape)."""
     shape = shape_of(value)

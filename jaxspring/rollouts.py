@@ -157,8 +157,15 @@ def rollout(
 def _warn(result: Result, dt: Array) -> None:
     """Warn of a dt and a dtype that may be at fault, at the line that called `rollout`."""
     if result.info.stable_dt is not None and bool(result.status.has(Flag.DT_LIMIT)):
-        text = f"dt = {float(dt):.6g} s, but this run is surely stable only up to {float(result.info.stable_dt):.6g} s"
-        warnings.warn(f"DT_LIMIT: {EXPLANATION[Flag.DT_LIMIT]}: {text}.", StabilityWarning, stacklevel=3)
+        limit = float(result.info.stable_dt)
+        if abs(float(dt)) > limit:
+            text = f"{EXPLANATION[Flag.DT_LIMIT]}: dt = {float(dt):.6g} s, but this run is surely stable only up to {limit:.6g} s"
+        else:
+            text = (
+                f"particles moved or met too fast for dt = {float(dt):.6g} s, which was below stable_dt at the start: one went in a step "
+                f"farther than half the list's skin, or dt is above the fluid's collision_dt. Lower dt, or widen the skin"
+            )
+        warnings.warn(f"DT_LIMIT: {text}.", StabilityWarning, stacklevel=3)
     if bool(result.status.has(Flag.PRECISION)):
         warnings.warn(f"PRECISION: {EXPLANATION[Flag.PRECISION]}.", StabilityWarning, stacklevel=3)
 

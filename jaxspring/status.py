@@ -58,7 +58,7 @@ EXPLANATION = {
     Flag.NEIGHBOUR_OVERFLOW: "the neighbour list is too small, nothing was left out; raise its capacity to the count or more",
     Flag.MAX_STEPS: "the adaptive solver ran out of steps; raise max_steps or loosen the tolerance",
     Flag.INTERRUPTED: "interrupted; the result holds what was done until then",
-    Flag.DT_LIMIT: "dt is above the stability limit of this stepper (see stable_dt)",
+    Flag.DT_LIMIT: "dt is too long: above the stability limit (see stable_dt), or for particles that move or meet so fast",
     Flag.PRECISION: "rounding of such large coordinates spoils the springs' forces; move the scene to the origin, or use float64",
     Flag.SOLVER: "the solver gave up: its solve did not reach the accuracy it needs, or its step shrank to the least allowed",
     Flag.UNSTABLE: "the forces balance, but the shape is no minimum of the energy: a small push makes it buckle; start from one",
@@ -168,7 +168,8 @@ def raise_for_status(result: Any) -> None:
     note = getattr(result, "effects", ())
     if not bool(np.all(np.asarray(status.is_ok))):
         hint = getattr(getattr(result, "info", None), "stable_dt", None)
-        limit = "" if hint is None else f" The stability limit of this run was dt = {float(np.min(np.asarray(hint))):.6g}."
+        least = np.inf if hint is None else float(np.min(np.asarray(hint)))
+        limit = f" The stability limit of this run was dt = {least:.6g}." if np.isfinite(least) else ""
         raise SimulationError(status.describe(note) + "." + limit)
     if bool(np.any(np.asarray(status.flags) != 0)):
         warnings.warn(status.describe(note), StabilityWarning, stacklevel=2)

@@ -146,3 +146,11 @@ def any_refused(*values: Any) -> Array:
     for leaf in jax.tree.leaves(values):
         bad = bad | ~jnp.all((leaf >= 0) & jnp.isfinite(leaf))
     return bad
+
+
+def any_not_positive(*values: Any) -> Array:
+    """True where any entry of any array is zero, negative, NaN or infinite."""
+    bad = any_refused(values)
+    for leaf in jax.tree.leaves(values):
+        bad = bad | jnp.any(leaf == 0)
+    return bad

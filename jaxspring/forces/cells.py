@@ -19,7 +19,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-Fields = tuple[Array, ...]
+from .pair_sums import Fields
 
 WORD = 32
 # Particles per cell for which the grid is made; a liquid has about 15 where its cells are as wide as the cut-off.

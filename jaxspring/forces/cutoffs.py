@@ -19,8 +19,12 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._checks import is_concrete
-from .pair_laws import PairLaw, _constant
+from .._checks import constant, is_concrete
+from .base import any_not_positive
+from .pair_laws import PairLaw
+
+# Why a radius of a switch is refused.
+NOTHING_LEFT = "A switch fades between two distances above zero."
 
 
 class Cutoff(eqx.Module):
@@ -38,6 +42,10 @@ class Cutoff(eqx.Module):
     @abc.abstractmethod
     def potential(self, law: PairLaw, squared: Array) -> Array:
         """The law's potential, cut off."""
+
+    def invalid(self) -> Array | None:
+        """Whether a constant has a value that the constructor would refuse."""
+        return None
 
 
 class NoCutoff(Cutoff):
@@ -63,12 +71,16 @@ class _AtRadius(Cutoff):
     radius: Array
 
     def __init__(self, radius: Any):
-        self.radius = _constant("radius", radius)
+        self.radius = constant("radius", radius, "No pair would be within it.")
 
     @property
     def reach(self) -> Array:
         """The radius [m]."""
         return self.radius
+
+    def invalid(self) -> Array:
+        """Whether the radius is not positive or not finite."""
+        return any_not_positive(self.radius)
 
 
 class PlainCutoff(_AtRadius):
@@ -79,11 +91,11 @@ class PlainCutoff(_AtRadius):
     """
 
     def weight(self, law: PairLaw, squared: Array) -> Array:
-        """W below the radius, zero from it on."""
+        """The law's w below the radius, zero from it on."""
         return _below(squared, self.radius, law.weight(squared))
 
     def potential(self, law: PairLaw, squared: Array) -> Array:
-        """U - U(c) below the radius, zero from it on."""
+        """The law's U - U(c) below the radius, zero from it on."""
         return _below(squared, self.radius, law.potential(squared) - law.potential(self.radius**2))
 
 
@@ -98,12 +110,12 @@ class ShiftedForce(_AtRadius):
     """
 
     def weight(self, law: PairLaw, squared: Array) -> Array:
-        """W - F(c) / r below the radius, zero from it on."""
+        """The law's w - F(c) / r below the radius, zero from it on."""
         end = law.weight(self.radius**2) * self.radius
         return _below(squared, self.radius, law.weight(squared) - end * jnp.sqrt(1 / squared))
 
     def potential(self, law: PairLaw, squared: Array) -> Array:
-        """U - U(c) + F(c) (r - c) below the radius, zero from it on."""
+        """The law's U - U(c) + F(c) (r - c) below the radius, zero from it on."""
         end = law.weight(self.radius**2) * self.radius
         shifted = law.potential(squared) - law.potential(self.radius**2) + end * (jnp.sqrt(squared) - self.radius)
         return _below(squared, self.radius, shifted)
@@ -121,7 +133,7 @@ class Switched(Cutoff):
     off: Array
 
     def __init__(self, on: Any, off: Any):
-        self.on, self.off = _constant("on", on), _constant("off", off)
+        self.on, self.off = constant("on", on, NOTHING_LEFT), constant("off", off, NOTHING_LEFT)
         if is_concrete(self.on) and is_concrete(self.off) and not bool(self.on < self.off):
             raise ValueError(f"on = {self.on} is not below off = {self.off}: the force would be switched off before it begins to fade.")
 
@@ -131,7 +143,7 @@ class Switched(Cutoff):
         return self.off
 
     def weight(self, law: PairLaw, squared: Array) -> Array:
-        """W S - (U - U(c)) S' / r below `off`, zero from it on."""
+        """Faded weight: w S - (U - U(c)) S' / r below `off`, zero from it on."""
         r = jnp.sqrt(squared)
         s = self._fraction(r)
         switch = 1 - s * s * s * (10 - s * (15 - 6 * s))
@@ -140,10 +152,14 @@ class Switched(Cutoff):
         return _below(squared, self.off, law.weight(squared) * switch - cut * slope / r)
 
     def potential(self, law: PairLaw, squared: Array) -> Array:
-        """(U - U(c)) S below `off`, zero from it on."""
+        """Faded potential: (U - U(c)) S below `off`, zero from it on."""
         s = self._fraction(jnp.sqrt(squared))
         switch = 1 - s * s * s * (10 - s * (15 - 6 * s))
         return _below(squared, self.off, (law.potential(squared) - law.potential(self.off**2)) * switch)
+
+    def invalid(self) -> Array:
+        """Whether a radius is not positive or not finite, or `on` is not below `off`."""
+        return any_not_positive(self.on, self.off) | ~(self.on < self.off)
 
     def _fraction(self, r: Array) -> Array:
         one = jnp.ones((), r.dtype)

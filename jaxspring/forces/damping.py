@@ -109,7 +109,7 @@ class Dashpots(Force):
         return self.net.accumulate(pulls)
 
     def damping_blocks(self, state: State) -> Blocks | None:
-        """C u u' per spring [N s/m], its direction taken as it is."""
+        """Blocks c u u' per spring [N s/m], its direction taken as it is."""
         if self.net.n_springs == 0:
             return None
         d = self.net.difference(state.position)

@@ -74,7 +74,7 @@ class DataSprings(Force):
         return jnp.sum(0.5 * self.stiffness * error * error)
 
     def stiffness_blocks(self, state: State, linearisation: Linearisation) -> Blocks:
-        """K on z [N/m]; where conservative k g g' with g = grad (d - z). The image's slope (its curvature) is left out."""
+        """Blocks k on z [N/m]; where conservative k g g' with g = grad (d - z). The image's slope (its curvature) is left out."""
         k = self.stiffness.astype(state.dtype)
         x, y, z = _coordinates(state)
         if self.conservative:

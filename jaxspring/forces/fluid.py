@@ -19,17 +19,17 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from .._checks import is_concrete
+from .._checks import constant, is_concrete, kind
 from ..numerics import any_lane, stopped
 from ..state import State
 from ..status import Flag, Status
 from ..topology.base import Topology
 from ..vector import Vector
-from .base import Finding, Force
+from .base import Finding, Force, any_not_positive
 from .cutoffs import Cutoff, NoCutoff
-from .molten import Molten
+from .molten import Molten, check_springs
 from .pair_drag import PairDrag
-from .pair_laws import PairLaw, _constant
+from .pair_laws import PairLaw
 from .pair_terms import Fields, PairTerms, Particles
 from .pairs import AllPairs, Pairs
 
@@ -51,6 +51,7 @@ class Fluid(Force):
         mass: [kg]; `System` fills it in.
 
     Raises:
+        TypeError: a law, cut-off, pairs, drag or molten of another kind.
         ValueError: a list without a cut-off, a core or a drag that does not fit inside it.
 
     >>> net = js.Graph.from_edges(np.zeros((0, 2), int), 2)
@@ -77,12 +78,13 @@ class Fluid(Force):
         core: Any = None,
         molten: Molten | None = None,
     ):
-        self.law = law
-        self.cutoff = NoCutoff() if cutoff is None else cutoff
-        self.pairs = AllPairs() if pairs is None else pairs
-        self.drag = drag
-        self.core = CORE_FRACTION * law.equilibrium_distance if core is None else _constant("core", core)
-        self.molten = molten
+        self.law = kind("law", law, PairLaw, "SlideLaw(alpha=1.0, beta=1.0)")
+        self.cutoff = NoCutoff() if cutoff is None else kind("cutoff", cutoff, Cutoff, "ShiftedForce(2.5)")
+        self.pairs = AllPairs() if pairs is None else kind("pairs", pairs, Pairs, "NeighbourList(capacity=96, skin=0.3)")
+        self.drag = None if drag is None else kind("drag", drag, PairDrag, "PairDrag(damping=1.0, radius=1.5)")
+        why = "Two particles at one place would have an infinite force."
+        self.core = CORE_FRACTION * law.equilibrium_distance if core is None else constant("core", core, why)
+        self.molten = None if molten is None else kind("molten", molten, Molten, "Molten(net)")
         self.mass = None
         self._check()
 
@@ -104,8 +106,10 @@ class Fluid(Force):
         """The same; refuses a second list, for which a state has no place.
 
         Raises:
-            ValueError: two fluids with neighbour lists in one system.
+            ValueError: two fluids with neighbour lists in one system, or springs that are not on the net of `molten`.
         """
+        if self.molten is not None:
+            check_springs("Molten", self.molten.net, forces)
         if self.pairs.needs_reach and sum(isinstance(f, Fluid) and f.pairs.needs_reach for f in forces) > 1:
             raise ValueError("two fluids of this system have a NeighbourList, but a state keeps one list. Give one of them AllPairs().")
         return self
@@ -182,6 +186,24 @@ class Fluid(Force):
         node = jnp.argmax(jnp.ravel(squared)).astype(jnp.int32)
         return 2 * lax.rsqrt(jnp.max(squared)), node
 
+    def invalid(self) -> Array:
+        """Whether a constant of law, cut-off, list, drag or core is one that its constructor refuses, or does not fit within the reach."""
+        bad = any_not_positive(self.core)
+        for by_part in (part.invalid() for part in (self.law, self.cutoff, self.pairs, self.drag) if part is not None):
+            bad = bad if by_part is None else bad | by_part
+        reach = self.cutoff.reach
+        if reach is not None:
+            for distance in self._within_reach().values():
+                bad = bad | _is_beyond(distance, reach)
+        return bad
+
+    def _within_reach(self) -> dict[str, Array]:
+        """Distances [m] that must not be beyond the cut-off."""
+        inner = {"core": self.core, "the equilibrium distance": self.law.equilibrium_distance}
+        if self.drag is not None and self.pairs.needs_reach:
+            inner["drag.radius"] = self.drag.radius
+        return inner
+
     def _check(self) -> None:
         reach = self.cutoff.reach
         if reach is None:
@@ -190,11 +212,8 @@ class Fluid(Force):
                     "a neighbour list needs a law that ends. Pass cutoff=PlainCutoff(r), ShiftedForce(r) or Switched(on, off)."
                 )
             return
-        inner = {"core": self.core, "the equilibrium distance": self.law.equilibrium_distance}
-        if self.drag is not None and self.pairs.needs_reach:
-            inner["drag.radius"] = self.drag.radius
-        for name, value in inner.items():
-            if is_concrete(value) and is_concrete(reach) and bool(value > reach.astype(value.dtype)):
+        for name, value in self._within_reach().items():
+            if is_concrete(value) and is_concrete(reach) and bool(_is_beyond(value, reach)):
                 raise ValueError(f"{name} = {value} m is beyond the cut-off, {reach} m. Unchecked, pairs between the two would be dropped.")
 
     def _sum(self, state: State, term: Callable[..., Fields], n: int, with_velocity: bool = False) -> Fields:
@@ -228,3 +247,9 @@ class Fluid(Force):
         if self.mass is None:
             raise ValueError("Fluid has no masses yet. Put it in a System and ask that, or the forces of system.prepare(state.dtype).")
         return jnp.broadcast_to(self.mass.astype(state.dtype), state.position.shape)
+
+
+def _is_beyond(distance: Array, reach: Array) -> Array:
+    """Whether a distance is beyond the reach; a cut-off at the distance itself is not, whatever its rounding."""
+    coarser = max(float(jnp.finfo(value.dtype).eps) for value in (distance, reach))
+    return distance > reach.astype(distance.dtype) * (1 + 8 * coarser)

@@ -56,12 +56,12 @@ class Hooke(Law):
     is_finite_at_zero: ClassVar[bool] = True
 
     def weight(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
-        """K (1 - l / r) [N/m]."""
+        """Weight k (1 - l / r) [N/m]."""
         # One rsqrt, guarded by a maximum: as fast as no guard. The derivative rule treats length zero.
         return stiffness * (1 - rest_length * _inverse_length(squared_length))
 
     def slope(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
-        """K l / r [N/m]."""
+        """Slope k l / r [N/m]."""
         return stiffness * (rest_length * _inverse_length(squared_length))
 
     def energy(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
@@ -76,7 +76,7 @@ class TensionOnly(Law):
     is_finite_at_zero: ClassVar[bool] = True
 
     def weight(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
-        """K max(0, 1 - l / r) [N/m]."""
+        """Weight k max(0, 1 - l / r) [N/m]."""
         return stiffness * jnp.maximum(1 - rest_length * _inverse_length(squared_length), jnp.zeros((), squared_length.dtype))
 
     def energy(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
@@ -101,12 +101,12 @@ class PowerLaw(Law):
             raise ValueError(f"exponent = {self.exponent}; expected 1 or more: below 1 the stiffness is infinite at rest.")
 
     def weight(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
-        """K l sign(e) |e / l|^n / r [N/m]."""
+        """Weight k l sign(e) |e / l|^n / r [N/m]."""
         strain = _length(squared_length) / rest_length - 1
         return stiffness * rest_length * jnp.sign(strain) * _power(jnp.abs(strain), self.exponent) * _inverse_length(squared_length)
 
     def energy(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
-        """K l^2 |e / l|^(n+1) / (n+1) [J]."""
+        """Energy k l^2 |e / l|^(n+1) / (n+1) [J]."""
         strain = _length(squared_length) / rest_length - 1
         return stiffness * rest_length * rest_length * _power(jnp.abs(strain), self.exponent + 1) / (self.exponent + 1)
 
@@ -173,7 +173,7 @@ def _zero_where_none(tangent: Any, primal: Any) -> Any:
 
 
 def _tangent(static: Any, residuals: Any, operand: Any) -> Vector:
-    """Dp = w dd + s u (u . dd) + (w_k dk + w_l dl + ...) d."""
+    """Tangent dp = w dd + s u (u . dd) + (w_k dk + w_l dl + ...) d."""
     d, stiffness, rest_length, params = residuals
     dd, *constants = operand
     squared, is_long = _guarded(d)

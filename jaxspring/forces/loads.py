@@ -40,7 +40,7 @@ class Gravity(Force):
         return self if self.mass is not None else Gravity(self.acceleration, mass)
 
     def force(self, state: State) -> Vector:
-        """M g [N]."""
+        """Weight m g [N]."""
         return Vector(tuple(self._weight(g, a) for g, a in zip(self._acceleration(state), state.position, strict=True)))
 
     def energy(self, state: State) -> Array:
@@ -69,12 +69,23 @@ class Load(Force):
     Attributes:
         value: `Vector` in node shape [N], or a function of time [s] that returns one.
 
+    Raises:
+        TypeError: anything else, e.g. an array.
+
     >>> import jax.numpy as jnp
     >>> from jaxspring.topology.lattice import lattice
     >>> push = Load.from_points(lattice(2), [[0.0, 0.0], [1.0, 0.0]])
     """
 
     value: Vector | Callable[[Array], Vector]
+
+    def __init__(self, value: Vector | Callable[[Array], Vector]):
+        if not isinstance(value, Vector) and not callable(value):
+            raise TypeError(
+                f"value is a {type(value).__name__}; expected a Vector in node shape, or a function of time that returns one. "
+                f"For an (N, D) array in the order of the nodes use Load.from_points(net, forces)."
+            )
+        self.value = value
 
     @staticmethod
     def from_points(net: Topology, forces: Any) -> Load:

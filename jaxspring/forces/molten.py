@@ -16,6 +16,8 @@ from jaxtyping import Array
 from ..state import State
 from ..topology.base import Topology
 from ..topology.edge_field import EdgeField
+from .base import Force
+from .springs import Springs
 
 
 class Molten(eqx.Module):
@@ -28,9 +30,33 @@ class Molten(eqx.Module):
     net: Topology
 
     def is_fluid(self, state: State) -> Array:
-        """Bool in node shape. Where springs do not break (`state.alive` is None), only nodes without any spring are fluid."""
+        """Bool in node shape. Where springs do not break (`state.alive` is None), only nodes without any spring are fluid.
+
+        Raises ValueError where `state.alive` tells about the springs of another net.
+        """
         if self.net.n_springs == 0:
             return jnp.ones(self.net.node_shape, bool)
         shapes = self.net.family_shapes
+        given = shapes if state.alive is None else tuple(entry.shape for entry in state.alive.families)
+        if given != shapes:
+            raise ValueError(
+                f"state.alive tells about springs in families of shapes {given}, but this net is a {_described(self.net)}.\n"
+                f"Pass the net that the springs and Fusing were built on; for frames of a run, use jax.vmap."
+            )
         alive = EdgeField(tuple(jnp.ones(shape, bool) for shape in shapes)) if state.alive is None else state.alive
         return self.net.incident_sum(alive.map(lambda a: a.astype(jnp.float32))) == 0
+
+
+def check_springs(who: str, net: Topology, forces: tuple[Force, ...]) -> None:
+    """Raise ValueError where there are springs, but none on the net of `who`: what is alive there would not be theirs."""
+    nets = [force.net for force in forces if isinstance(force, Springs)]
+    if nets and all(other.family_shapes != net.family_shapes for other in nets):
+        raise ValueError(
+            f"{who} has a {_described(net)}, but the Springs of this system have a {_described(nets[0])}.\n"
+            f"Unchecked, {who} would tell about springs that nothing holds, and those of Springs would never break, without a word.\n"
+            f"Build both on one net: pass that of Springs to {who}."
+        )
+
+
+def _described(net: Topology) -> str:
+    return f"{type(net).__name__} of {net.n_springs} springs in families of shapes {net.family_shapes}"

@@ -22,13 +22,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from .._checks import constant
 from ..numerics import any_lane
 from ..status import Flag, Status
 from .cells import Neighbourhood, find_neighbours
-from .pair_laws import _constant
+from .pair_sums import Fields
 from .pairs import AllPairs, PairFunction, Pairs
-
-Fields = tuple[Array, ...]
 
 # Neighbours taken at a time: fewer write the sums more often; more make loops that XLA shares between cores though they are short.
 SLOTS = 4
@@ -81,10 +80,10 @@ class NeighbourList(Pairs):
     skin: Array
 
     def __init__(self, capacity: int, skin: Any):
-        if not isinstance(capacity, int) or isinstance(capacity, bool) or capacity < 1:
+        if not isinstance(capacity, (int, np.integer)) or isinstance(capacity, bool) or capacity < 1:
             raise ValueError(f"capacity = {capacity!r}; expected a whole number of neighbours, 1 or more.")
-        self.capacity = -(-capacity // SLOTS) * SLOTS
-        self.skin = _constant("skin", skin)
+        self.capacity = -(-int(capacity) // SLOTS) * SLOTS
+        self.skin = constant("skin", skin, "The list would be out of date after any step.")
 
     @property
     def needs_reach(self) -> bool:

@@ -15,8 +15,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._checks import as_inexact, has_shape, nonnegative
-from .pair_laws import _constant
+from .._checks import constant
+from .base import any_not_positive, any_refused
 
 
 class PairDrag(eqx.Module):
@@ -31,12 +31,14 @@ class PairDrag(eqx.Module):
     radius: Array
 
     def __init__(self, damping: Any, radius: Any):
-        self.damping = as_inexact("damping", damping)
-        has_shape("damping", self.damping, {"one number": ()})
-        nonnegative("damping", self.damping, "A negative drag feeds energy in.")
-        self.radius = _constant("radius", radius)
+        self.damping = constant("damping", damping, "A negative drag feeds energy in.", may_be_zero=True)
+        self.radius = constant("radius", radius, "No pair would be within it: pass drag=None for no drag.")
 
     def rate(self, squared: Array) -> Array:
-        """C(r) [N s/m] of a squared distance [m^2]."""
+        """Coefficient c(r) [N s/m] of a squared distance [m^2]."""
         near = jnp.maximum(1 - jnp.sqrt(squared) / self.radius, jnp.zeros((), squared.dtype))
         return self.damping * near * near
+
+    def invalid(self) -> Array:
+        """Whether eta is negative, or R not positive, or one of them not finite."""
+        return any_refused(self.damping) | any_not_positive(self.radius)

@@ -21,10 +21,14 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from .._checks import as_inexact, finite, has_shape, nonnegative, positive
+from .._checks import constant
+from .base import any_not_positive, any_refused
 
 # Newton's steps for an equilibrium without closed form: the function is concave and rising, so that it converges from the left for all.
 N_NEWTON = 60
+# Why a constant is refused.
+NO_REST = "Pairs would have no distance of equilibrium."
+SINGULAR = "The attraction would be singular at a distance above zero."
 
 
 class PairLaw(eqx.Module):
@@ -40,7 +44,7 @@ class PairLaw(eqx.Module):
 
     @abc.abstractmethod
     def weight(self, squared: Array) -> Array:
-        """W of a squared distance [m^2], above zero: the force on i is q_i q_j w (x_i - x_j)."""
+        """Weight w of a squared distance [m^2], above zero: the force on i is q_i q_j w (x_i - x_j)."""
 
     @abc.abstractmethod
     def potential(self, squared: Array) -> Array:
@@ -65,6 +69,10 @@ class PairLaw(eqx.Module):
         """k_0 per q_i q_j, the stiffness at the equilibrium distance; a pair swings at sqrt(q_i q_j k_0 (1/m_i + 1/m_j)) [rad/s]."""
         return self.stiffness(self.equilibrium_distance)
 
+    def invalid(self) -> Array | None:
+        """Whether a constant has a value that the constructor would refuse."""
+        return None
+
 
 class _PowerPair(PairLaw):
     """What the slides' law and its unit-vector form share."""
@@ -76,9 +84,9 @@ class _PowerPair(PairLaw):
     b: int = eqx.field(static=True)
 
     def __init__(self, alpha: Any, beta: Any, zeta: Any = 0.0, a: int = 2, b: int = 4):
-        self.alpha = _constant("alpha", alpha)
-        self.beta = _constant("beta", beta)
-        self.zeta = _constant("zeta", zeta, may_be_zero=True)
+        self.alpha = constant("alpha", alpha, NO_REST)
+        self.beta = constant("beta", beta, NO_REST)
+        self.zeta = constant("zeta", zeta, SINGULAR, may_be_zero=True)
         if not (isinstance(a, int) and isinstance(b, int) and 1 <= a < b and b >= 3):
             why = "The repulsion must rise faster than the attraction."
             raise ValueError(f"a = {a!r}, b = {b!r}; expected whole numbers, 1 <= a < b and b >= 3. {why}")
@@ -105,6 +113,10 @@ class _PowerPair(PairLaw):
         # The root is found without derivative; one more step brings the exact derivative in.
         root = lax.stop_gradient(lax.fori_loop(0, N_NEWTON, step, target / (self.b - self.a)))
         return jnp.exp(step(None, root))
+
+    def invalid(self) -> Array:
+        """Whether alpha or beta is not positive, or zeta negative, or one of them not finite."""
+        return any_not_positive(self.alpha, self.beta) | any_refused(self.zeta)
 
 
 class SlideLaw(_PowerPair):
@@ -139,7 +151,7 @@ class SlideLaw(_PowerPair):
         return self.alpha * _rising(r + self.zeta, self.zeta, self.a) + self.beta * lax.integer_pow(1 / r, self.b - 2) / (self.b - 2)
 
     def turning_stiffness(self, energy: Array, core: Array) -> Array:
-        """(b - 1) beta / r**b where beta / ((b - 2) r**(b-2)) is the energy."""
+        """Repulsion's (b - 1) beta / r**b where beta / ((b - 2) r**(b-2)) is the energy."""
         inverse = jnp.minimum(((self.b - 2) * energy / self.beta) ** (1 / (self.b - 2)), 1 / core)
         return (self.b - 1) * self.beta * lax.integer_pow(inverse, self.b)
 
@@ -172,7 +184,7 @@ class UnitVectorLaw(_PowerPair):
         return self.alpha * far + self.beta * lax.integer_pow(1 / r, self.b - 1) / (self.b - 1)
 
     def turning_stiffness(self, energy: Array, core: Array) -> Array:
-        """B beta / r**(b+1) where beta / ((b - 1) r**(b-1)) is the energy."""
+        """Repulsion's b beta / r**(b+1) where beta / ((b - 1) r**(b-1)) is the energy."""
         inverse = jnp.minimum(((self.b - 1) * energy / self.beta) ** (1 / (self.b - 1)), 1 / core)
         return self.b * self.beta * lax.integer_pow(inverse, self.b + 1)
 
@@ -193,8 +205,8 @@ class LennardJones(PairLaw):
     sigma: Array
 
     def __init__(self, epsilon: Any, sigma: Any):
-        self.epsilon = _constant("epsilon", epsilon)
-        self.sigma = _constant("sigma", sigma)
+        self.epsilon = constant("epsilon", epsilon, NO_REST)
+        self.sigma = constant("sigma", sigma, NO_REST)
 
     @property
     def uses_mass(self) -> bool:
@@ -222,6 +234,10 @@ class LennardJones(PairLaw):
         ratio = jnp.minimum((energy / (4 * self.epsilon)) ** (1 / 12), self.sigma / core)
         return 624 * self.epsilon * lax.integer_pow(ratio, 14) / (self.sigma * self.sigma)
 
+    def invalid(self) -> Array:
+        """Whether epsilon or sigma is not positive or not finite."""
+        return any_not_positive(self.epsilon, self.sigma)
+
 
 def gentle_fluid(spacing: Any, zeta: Any = 0.0, alpha: Any = 1.0) -> SlideLaw:
     """The slides' law whose pairs rest at the lattice's spacing h, so that a spring that fuses leaves its two particles without a push.
@@ -236,7 +252,8 @@ def gentle_fluid(spacing: Any, zeta: Any = 0.0, alpha: Any = 1.0) -> SlideLaw:
     >>> round(float(gentle_fluid(spacing=0.5, zeta=0.1).equilibrium_distance), 6)
     0.5
     """
-    h, zeta, alpha = _constant("spacing", spacing), _constant("zeta", zeta, may_be_zero=True), _constant("alpha", alpha)
+    h = constant("spacing", spacing, "Particles of a lattice are apart.")
+    zeta, alpha = constant("zeta", zeta, SINGULAR, may_be_zero=True), constant("alpha", alpha, NO_REST)
     return SlideLaw(alpha, alpha * lax.integer_pow(h, 4) / lax.integer_pow(h + zeta, 2), zeta)
 
 
@@ -248,14 +265,3 @@ def _rising(shifted: Array, zeta: Array, a: int) -> Array:
         return jnp.log(shifted) + zeta / shifted
     inverse = 1 / shifted
     return zeta * lax.integer_pow(inverse, a - 1) / (a - 1) - lax.integer_pow(inverse, a - 2) / (a - 2)
-
-
-def _constant(name: str, value: Any, may_be_zero: bool = False) -> Array:
-    value = as_inexact(name, value)
-    has_shape(name, value, {"one number": ()})
-    finite(name, value)
-    if may_be_zero:
-        nonnegative(name, value, "The attraction would be singular at a distance above zero.")
-    else:
-        positive(name, value, "Pairs would have no distance of equilibrium.")
-    return value

@@ -21,6 +21,7 @@ from jaxtyping import Array
 
 from ..numerics import linear_call
 
+# One array per coordinate or quantity.
 Fields = tuple[Array, ...]
 
 

@@ -20,8 +20,7 @@ from jaxtyping import Array
 from .cutoffs import Cutoff
 from .pair_drag import PairDrag
 from .pair_laws import PairLaw
-
-Fields = tuple[Array, ...]
+from .pair_sums import Fields
 
 
 class Arrangement(eqx.Module):

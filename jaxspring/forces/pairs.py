@@ -14,9 +14,11 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from ..status import Status
+from .base import any_not_positive
 from .pair_sums import Fields, summed
 
 # (own fields, other's fields, whether the two are two; None: all are) -> values, all arrays that broadcast against each other.
@@ -76,6 +78,10 @@ class Pairs(eqx.Module):
         """Capacity that the memory would need where it is too small, else 0; None where nothing is remembered."""
         return None
 
+    def invalid(self) -> Array | None:
+        """Whether an array of it (a length, unless a subclass says otherwise) is not positive or not finite."""
+        return any_not_positive(eqx.filter(self, eqx.is_array))
+
 
 class AllPairs(Pairs):
     """Every pair, in tiles of rows, so that memory stays bounded: N**2 evaluations.
@@ -87,9 +93,9 @@ class AllPairs(Pairs):
     tile: int | None = eqx.field(static=True)
 
     def __init__(self, tile: int | None = None):
-        if tile is not None and (not isinstance(tile, int) or isinstance(tile, bool) or tile < 1):
+        if tile is not None and (not isinstance(tile, (int, np.integer)) or isinstance(tile, bool) or tile < 1):
             raise ValueError(f"tile = {tile!r}; expected a whole number of rows, 1 or more, or None.")
-        self.tile = tile
+        self.tile = None if tile is None else int(tile)
 
     def visit(self, function: PairFunction, fields: Fields, memory: Any = None) -> Fields:
         """Sum over all others, a tile of rows at a time."""

@@ -76,7 +76,7 @@ class Rayleigh(Force):
         return Rayleigh(2 * w * w2 * (z * w2 - z2 * w) / span, 2 * (z2 * w2 - z * w) / span, forces)
 
     def damping_ratio(self, frequency: Any) -> Array:
-        """Zeta = a / (2 w) + b w / 2 at frequencies [rad/s]; 1 is critical."""
+        """Damping ratio zeta = a / (2 w) + b w / 2 at frequencies [rad/s]; 1 is critical."""
         w = as_inexact("frequency", frequency)
         return self.mass_rate.astype(w.dtype) / (2 * w) + 0.5 * self.stiffness_time.astype(w.dtype) * w
 
@@ -107,7 +107,7 @@ class Rayleigh(Force):
         return -self.damping_blocks(state).product(state.velocity)
 
     def damping_blocks(self, state: State) -> Blocks:
-        """A M + b K in this state [N s/m]."""
+        """Blocks of a M + b K in this state [N s/m]."""
         mass, forces = self._bound()
         blocks = Blocks((isotropic(self.mass_rate * mass, state.position),))
         for force in forces:
@@ -121,14 +121,14 @@ class Rayleigh(Force):
         return False
 
     def damping_bound(self, state: State) -> Array:
-        """A m + b times the bound of the stiffness [N s/m]."""
+        """Upper bound a m + b times the bound of the stiffness [N s/m]."""
         mass, forces = self._bound()
         bounds = [force.stiffness_bound(state) for force in forces if force.stiffness_blocks(state, Tangent()) is not None]
         start = (self.mass_rate * mass).astype(state.dtype)
         return sum((self.stiffness_time * bound for bound in bounds if bound is not None), start=start)
 
     def damping_floor(self, state: State) -> Array:
-        """A m [N s/m]."""
+        """Lower bound a m [N s/m]."""
         return (self.mass_rate * self._bound()[0]).astype(state.dtype)
 
     def invalid(self) -> Array:

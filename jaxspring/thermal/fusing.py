@@ -20,7 +20,7 @@ from jaxtyping import Array
 
 from .._checks import as_inexact, finite, has_shape, nonnegative, positive
 from ..forces.base import Force, Rule
-from ..forces.molten import Molten
+from ..forces.molten import Molten, check_springs
 from ..forces.springs import Springs
 from ..numerics import cast_inexact
 from ..state import State
@@ -59,8 +59,8 @@ class Fusing(Rule):
         springs: those whose rest lengths change when they come back; the system fills it in.
 
     Raises:
-        ValueError: a melting point that is not finite; at the start of a run a state without temperature, or refreezing without springs
-            of this net.
+        ValueError: a melting point that is not finite; at the start of a run a state without temperature, springs on another net only, or
+            refreezing without springs of this net.
 
     >>> import jaxspring as js
     >>> net = js.lattice(3)
@@ -86,7 +86,11 @@ class Fusing(Rule):
         self.springs = None
 
     def with_forces(self, forces: tuple[Force, ...]) -> Fusing:
-        """The same, knowing the springs that may come back."""
+        """The same, knowing the springs that may come back.
+
+        Raises ValueError where no `Springs` of the system is on this net.
+        """
+        check_springs("Fusing", self.net, forces)
         if self.refreezing is None:
             return self
         own = [f for f in forces if isinstance(f, Springs) and f.net.family_shapes == self.net.family_shapes]
@@ -131,7 +135,10 @@ class Fusing(Rule):
 
 
 def melted_fraction(net: Topology, state: State) -> Array:
-    """Share of the particles that no living spring holds (leading axes of saved states are not accepted: use `jax.vmap`)."""
+    """Share of the particles that no living spring holds (leading axes of saved states are not accepted: use `jax.vmap`).
+
+    Raises ValueError where the state's springs are those of another net.
+    """
     return jnp.mean(Molten(net).is_fluid(state).astype(state.dtype))
 
 

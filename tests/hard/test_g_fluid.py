@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxspring as js
-from tests.particles import blob, components, make, slide_force
+from tests.particles import blob, components, free_net, make, slide_force
 
 OVERLAP, DT_LIMIT, OVERFLOW = js.Flag.OVERLAP, js.Flag.DT_LIMIT, js.Flag.NEIGHBOUR_OVERFLOW
 
@@ -87,6 +87,33 @@ def test_g5_head_on(rng):
         status, _ = run(dt)
         assert bool(status.has(DT_LIMIT)), dt
         assert int(status.step) == 1
+
+
+@pytest.mark.parametrize(
+    ("dt", "points", "speed", "text"),
+    [
+        # stable_dt is infinite: no pair is within the cut-off.
+        (0.02, [[0.0, 0.0], [9.0, 0.0]], 50.0, "particles moved or met too fast for dt = 0.02 s.*Lower dt, or widen the skin"),
+        (0.5, [[0.0, 0.0], [1.2, 0.0]], 0.0, r"dt = 0\.5 s, but this run is surely stable only up to 0\.\d+ s"),
+    ],
+)
+def test_g5_the_warning_names_the_limit_that_was_passed(dt, points, speed, text):
+    """A dt above stable_dt is told with it; below it the warning speaks of the particles, and of no limit that dt keeps."""
+    options = {"law": js.LennardJones(1.0, 1.0), "cutoff": js.PlainCutoff(2.5), "pairs": js.NeighbourList(4, 0.3)}
+    system, state = make(np.array(points), velocities=np.array([[speed, 0.0], [0.0, 0.0]]), **options)
+    with pytest.warns(js.StabilityWarning, match=f"DT_LIMIT: .*{text}") as told:
+        js.rollout(system, state, js.SymplecticEuler(), dt, 1)
+    assert "inf s" not in str(told[0].message)
+
+
+def test_g5_an_error_names_no_infinite_limit():
+    """Where nothing limits dt, an error does not say that the limit was infinite."""
+    fast = np.array([[1e307, 0.0], [0.0, 0.0]])
+    system, state = make(np.array([[0.0, 0.0], [9.0, 0.0]]), law=js.LennardJones(1.0, 1.0), cutoff=js.PlainCutoff(2.5), velocities=fast)
+    result = jax.jit(lambda dt: js.rollout(system, state, js.SymplecticEuler(), dt, 1))(100.0)
+    with pytest.raises(js.SimulationError) as told:
+        js.raise_for_status(result)
+    assert "inf" not in str(told.value).replace("infin", "")
 
 
 def test_g6_what_a_cutoff_leaves_out(rng):
@@ -202,3 +229,59 @@ def test_g8_no_particle_at_all():
     """A net without a node is refused when it is built, so that no fluid can be on it."""
     with pytest.raises(ValueError, match="n_nodes = 0"):
         make(np.zeros((0, 2)))
+
+
+TRACED = {
+    "epsilon": lambda bad: js.Fluid(js.LennardJones(bad, 1.0)),
+    "sigma": lambda bad: js.Fluid(js.LennardJones(1.0, bad)),
+    "alpha": lambda bad: js.Fluid(js.SlideLaw(bad, 1.0)),
+    "beta": lambda bad: js.Fluid(js.UnitVectorLaw(1.0, bad)),
+    "radius": lambda bad: js.Fluid(js.LennardJones(1.0, 1.0), js.PlainCutoff(bad)),
+    "on": lambda bad: js.Fluid(js.LennardJones(1.0, 1.0), js.Switched(bad, 2.5)),
+    "off": lambda bad: js.Fluid(js.LennardJones(1.0, 1.0), js.Switched(1.5, bad)),
+    "skin": lambda bad: js.Fluid(js.LennardJones(1.0, 1.0), js.PlainCutoff(2.5), js.NeighbourList(4, bad)),
+    "drag": lambda bad: js.Fluid(js.LennardJones(1.0, 1.0), drag=js.PairDrag(bad, 1.5)),
+    "drag.radius": lambda bad: js.Fluid(js.LennardJones(1.0, 1.0), drag=js.PairDrag(1.0, bad)),
+    "core": lambda bad: js.Fluid(js.LennardJones(1.0, 1.0), core=bad),
+    "zeta": lambda bad: js.Fluid(js.SlideLaw(1.0, 1.0, bad)),
+}
+MAY_BE_ZERO = ("drag", "zeta")
+
+
+def is_refused(build, value):
+    """Whether the fluid that `build` makes of a traced value says that it is invalid."""
+    return bool(jax.jit(lambda v: build(v).invalid())(value))
+
+
+def test_g9_a_run_with_a_traced_constant_of_the_wrong_sign():
+    """The status of a run says INVALID, before the first step, and which force."""
+    net = free_net(2)
+    state = js.State.from_points(net, [[0.0, 0.0], [1.2, 0.0]])
+    status = jax.jit(lambda v: js.rollout(js.System(net, 1.0, TRACED["epsilon"](v)), state, js.SymplecticEuler(), 1e-4, 1).status)
+    assert not status(1.0).has(js.Flag.INVALID)
+    refused = status(-1.0)
+    assert refused.has(js.Flag.INVALID)
+    assert (int(refused.step), int(refused.effect)) == (0, 0)
+
+
+@pytest.mark.parametrize("name", TRACED)
+def test_g9_traced_constants_of_the_wrong_sign(name):
+    """Below zero, zero (but for drag and zeta) and NaN are INVALID where the constructor cannot look; a good value is not."""
+    good = {"radius": 2.5, "on": 1.5, "off": 2.5}.get(name, 0.9)
+    assert not is_refused(TRACED[name], good)
+    for bad in (-1.0, np.nan, *(() if name in MAY_BE_ZERO else (0.0,))):
+        assert is_refused(TRACED[name], bad), bad
+    if name in MAY_BE_ZERO:
+        assert not is_refused(TRACED[name], 0.0)
+
+
+def test_g9_traced_distances_beyond_the_reach():
+    """A cut-off below r_0, the core or the list's drag, and a switch that ends before it begins, are INVALID; one at r_0 is none."""
+    lj, r_0 = js.LennardJones(1.0, 1.0), 2 ** (1 / 6)
+    assert is_refused(lambda c: js.Fluid(lj, js.PlainCutoff(c)), 0.5)
+    assert not is_refused(lambda c: js.Fluid(lj, js.PlainCutoff(c)), r_0)
+    assert not is_refused(lambda c: js.Fluid(lj, js.PlainCutoff(c)), np.float32(r_0))
+    assert is_refused(lambda c: js.Fluid(lj, js.PlainCutoff(2.5), core=c), 2.6)
+    assert is_refused(lambda c: js.Fluid(lj, js.Switched(c, 2.5)), 2.6)
+    assert is_refused(lambda c: js.Fluid(lj, js.PlainCutoff(2.5), js.NeighbourList(4, 0.3), js.PairDrag(1.0, c)), 2.6)
+    assert not is_refused(lambda c: js.Fluid(lj, js.PlainCutoff(2.5), drag=js.PairDrag(1.0, c)), 2.6)

@@ -133,3 +133,10 @@ def test_wrong_loads_are_refused(make, message):
     """Each wrong constant or shape is a ValueError that names it."""
     with pytest.raises(ValueError, match=message):
         make()
+
+
+@pytest.mark.parametrize("value", [np.ones((3, 2)), jnp.ones((3, 2)), [[1.0, 0.0]], None])
+def test_a_load_that_is_no_vector(value):
+    """An array of forces is refused when the load is built, and pointed to `from_points`."""
+    with pytest.raises(TypeError, match=r"expected a Vector .* Load.from_points\(net, forces\)"):
+        js.Load(value)

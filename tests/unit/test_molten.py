@@ -61,6 +61,20 @@ def test_melted_fraction():
         assert float(js.melted_fraction(net, with_springs(net, state, alive))) == share
 
 
+def test_molten_of_another_net_than_the_springs():
+    """A fluid, and a share that has melted, on a net whose springs are not those that break are refused with both nets."""
+    bare, sheared = js.lattice((3, 3)), js.lattice((3, 3), js.STRUCTURAL + js.SHEAR)
+    state = js.State.from_points(sheared, sheared.grid())
+    fluid = js.Fluid(js.gentle_fluid(1.0), molten=js.Molten(bare))
+    system = js.System(sheared, 1.0, (js.Springs(sheared, 1.0, 1.0), fluid))
+    both = r"Molten has a Lattice of 12 springs .* Springs of this system have a Lattice of 20 springs"
+    with pytest.raises(ValueError, match=both):
+        system.force(state)
+    whole = js.EdgeField(tuple(jnp.ones(shape, bool) for shape in sheared.family_shapes))
+    with pytest.raises(ValueError, match=r"state.alive tells about springs .* Lattice of 12 springs"):
+        js.melted_fraction(bare, dataclasses.replace(state, alive=whole))
+
+
 @pytest.mark.parametrize("pairs", [js.AllPairs(), js.AllPairs(2), js.NeighbourList(8, 0.5)], ids=["all", "tiles", "list"])
 def test_mixed_pairs_repel_only(pairs):
     """Two fluid particles have the whole law, a fluid and a solid one its repulsion, two solid ones nothing; pair by pair in NumPy."""
@@ -246,7 +260,13 @@ LISTED = js.Fluid(js.SlideLaw(1.0, 1.0), js.PlainCutoff(2.0), js.NeighbourList(8
         (lambda: js.AllPairs(0), "tile = 0"),
         (lambda: js.NeighbourList(0, 0.1), "capacity = 0"),
         (lambda: js.NeighbourList(8, 0.0), "skin = 0.0, but must be positive"),
+        (lambda: js.NeighbourList(8, -1.0), "skin = -1.0, but must be positive. The list would be out of date"),
         (lambda: js.PairDrag(-1.0, 1.0), "damping = -1.0"),
+        (lambda: js.PairDrag(1.0, 0.0), "radius = 0.0, but must be positive. No pair would be within it"),
+        (lambda: js.PlainCutoff(0.0), "radius = 0.0, but must be positive. No pair would be within it"),
+        (lambda: js.Switched(-1.0, 2.0), "on = -1.0, but must be positive. A switch fades"),
+        (lambda: js.gentle_fluid(-1.0), "spacing = -1.0, but must be positive. Particles of a lattice"),
+        (lambda: js.Fluid(js.SlideLaw(1.0, 1.0), core=0.0), "core = 0.0, but must be positive. Two particles at one place"),
         (lambda: js.Fluid(js.SlideLaw(1.0, 1.0), pairs=js.NeighbourList(8, 0.1)), "a neighbour list needs a law that ends"),
         (lambda: js.Fluid(js.SlideLaw(1.0, 1.0), Endless(), js.NeighbourList(8, 0.1)), "a neighbour list needs a law that ends"),
         (lambda: js.Fluid(js.SlideLaw(1.0, 1.0), js.PlainCutoff(0.9)), "the equilibrium distance = 1.0 m is beyond the cut-off"),
@@ -284,3 +304,30 @@ def test_a_list_rests_until_something_melts():
     assert int(cold.neighbours.rebuilds) == 0
     assert int(listed.neighbours.rebuilds) > 0
     np.testing.assert_allclose(listed.points, everyone.points, rtol=1e-13)
+
+
+LJ = js.LennardJones(1.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: js.Fluid(LJ, 2.5), r"cutoff is 2.5, a float; expected a Cutoff, e.g. ShiftedForce\(2.5\)"),
+        (lambda: js.Fluid("lj"), "law is 'lj', a str; expected a PairLaw"),
+        (lambda: js.Fluid(js.LennardJones), "law is the class LennardJones; expected a PairLaw. Make one"),
+        (lambda: js.Fluid(LJ, js.PlainCutoff(2.5), "list"), "pairs is 'list', a str; expected a Pairs"),
+        (lambda: js.Fluid(LJ, drag=0.5), "drag is 0.5, a float; expected a PairDrag"),
+        (lambda: js.Fluid(LJ, molten=js.lattice(2)), r"molten is .*, a Lattice; expected a Molten, e.g. Molten\(net\)"),
+    ],
+)
+def test_parts_of_another_kind(build, message):
+    """A part of a fluid of another kind is refused when it is built, with an example of the right one."""
+    with pytest.raises(TypeError, match=message):
+        build()
+
+
+def test_whole_numbers_of_numpy():
+    """Sizes may come from NumPy, and are kept as Python's."""
+    assert js.NeighbourList(np.int64(18), 0.3).capacity == js.NeighbourList(18, 0.3).capacity == 20
+    tile = js.AllPairs(np.int32(20)).tile
+    assert (tile, type(tile)) == (20, int)

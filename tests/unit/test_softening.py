@@ -140,6 +140,7 @@ def test_broken_springs_by_where():
     np.testing.assert_allclose(endless.force(state).x, [3, -3, 3, 0, -3], atol=1e-13)
 
 
+BARE = js.lattice((4, 5))
 WHOLE_SHEET = js.EdgeField(tuple(jnp.ones(shape, bool) for shape in SHEET.family_shapes))
 
 
@@ -159,6 +160,10 @@ WHOLE_SHEET = js.EdgeField(tuple(jnp.ones(shape, bool) for shape in SHEET.family
             "one Springs on the net of Fusing, whose rest lengths change; this system has 0",
         ),
         (lambda: js.Fusing(CHAIN, 1.0).begin(dataclasses.replace(warm(CHAIN, 1.0), alive=WHOLE_SHEET)), "of another net than Fusing"),
+        (
+            lambda: js.System(SHEET, 1.0, js.Springs(SHEET, 1.0, 1.0), rules=js.Ledger(js.Fusing(BARE, 1.0))).prepare(float),
+            r"Fusing has a Lattice of \d+ springs .* Springs of this system have a Lattice of \d+ springs",
+        ),
         (lambda: js.System(CHAIN, 1.0, rules=js.Fusing(CHAIN, 1.0)).begin(js.State.from_points(CHAIN, CHAIN.grid())), "from_points"),
     ],
 )
@@ -166,6 +171,15 @@ def test_refusals(make, match):
     """Constants without meaning, and a state without temperature, are refused with what to do."""
     with pytest.raises(ValueError, match=match):
         make()
+
+
+def test_fusing_beside_springs_of_other_nets():
+    """One Springs on the net of Fusing is enough; a system without Springs may fuse for forces of its own."""
+    beside = (js.Springs(SHEET, 1.0, 1.0), js.Springs(BARE, 1.0, 1.0))
+    system = js.System(SHEET, 1.0, beside, rules=js.Fusing(BARE, 350.0))
+    end = js.rollout(system, warm(SHEET, 400.0), js.Still(), 0.1, 1).state
+    assert not BARE.flatten(end.alive).any()
+    js.System(BARE, 1.0, js.Drag(1.0), rules=js.Fusing(BARE, 350.0)).prepare(float)
 
 
 def on_floor(velocity, friction=0.0, restitution=0.0, height=-0.1):

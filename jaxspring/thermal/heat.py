@@ -97,7 +97,8 @@ class Heat(Rule):
         boundaries: one or several; where none is named the body is insulated.
         source: [W]: a number, (N,) in the user's order, or a function of time [s] that gives a number or a node array.
         substeps: heat steps in one step of the nodes, of dt / substeps each.
-        every: steps of the nodes in one heat step, of every * dt. In between the temperature stands still.
+        every: steps of the nodes in one heat step, of every * dt, which falls on the multiples of that on the time axis. In between
+            the temperature stands still.
         latent: melting, with values in node shape.
         cut_by: the system's net, where broken springs are to conduct nothing. On a lattice it must have every family of `net`.
         """
@@ -144,11 +145,17 @@ class Heat(Rule):
         if self.every == 1:
             y, status = ready._advanced(flow, y, dt)
         else:
-            # The number of the step is read from the time, which is start + i dt.
-            number = jnp.round(state.time / jnp.where(dt == 0, jnp.ones_like(dt), dt))
-            is_due = (jnp.mod(number, self.every) == 0) & (dt != 0)
+            is_due = self._count(state.time, dt) > self._count(before.time, dt)
             y, status = lax.cond(is_due, lambda y: ready._advanced(flow, y, self.every * dt), lambda y: (y, Status.ok()), y)
         return _left(flow, y, state), refused.then(status)
+
+    def _count(self, time: Array, dt: Array) -> Array:
+        """Heat steps that were due up to a time: they fall on the multiples of every * dt.
+
+        A step of the nodes takes the difference between its two ends, so that none is lost or taken twice by rounding. The quarter keeps
+        rounding of times that are multiples of dt from moving a heat step to the next step of the nodes.
+        """
+        return jnp.floor((time / jnp.where(dt == 0, jnp.ones_like(dt), dt) + 0.25) / self.every)
 
     def _advanced(self, flow: Flow, y: Array, span: Array) -> tuple[Array, Status]:
         """Heat for a time `span` [s] that ends at the flow's."""

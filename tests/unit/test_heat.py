@@ -176,6 +176,38 @@ def test_heat_steps_within_a_step_see_their_own_time():
         assert float(end.temperature[0]) == pytest.approx(300 + np.sum((0.05 * np.arange(20)) ** 2) * 0.05, rel=1e-14)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("every", "dtype"), [(2, "float32"), (4, "float64")])
+@pytest.mark.parametrize("start", [0.0, 0.05, 0.075, 0.25, 0.3, 1234.567])
+def test_heat_that_comes_seldom_comes_as_often_from_any_start(start, every, dtype):
+    """1 W for 4.8 s warms by 4.8 K in one run, in pieces of 7 steps and in resumed ones, to one heat step; dt = 0 does not warm at all."""
+    net, n_steps = js.lattice(3), 48
+    system = js.System(net, 1.0, rules=js.Heat(net, 1.0, 0.01, source=1.0, every=every))
+    first = js.State.from_points(net, net.grid().astype(dtype), temperature=np.full(3, 300.0, dtype), time=start)
+    assert first.dtype == dtype
+    unbroken = js.rollout(system, first, js.Still(), 0.1, n_steps)
+    pieces, resumed, resume = first, first, None
+    for n in (7, 7, 7, 7, 7, 7, 6):
+        pieces = js.rollout(system, pieces, js.Still(), 0.1, n).state
+        run = js.rollout(system, resumed, js.Still(), 0.1, n, resume=resume)
+        resumed, resume = run.state, run.resume
+    for end in (unbroken.state, pieces):
+        assert abs(float(end.temperature.mean()) - 304.8) <= 0.1 * every + 1e-3
+    np.testing.assert_array_equal(resumed.temperature, unbroken.state.temperature)
+    np.testing.assert_array_equal(js.rollout(system, first, js.Still(), 0.0, 8).state.temperature, first.temperature)
+
+
+@pytest.mark.slow
+def test_heat_that_comes_seldom_follows_a_change_of_dt():
+    """Runs of 0.1 s, 0.2 s and 0.04 s a step, one after the other, warm by 1 K/s, each to one heat step of its own."""
+    net = js.lattice(3)
+    system = js.System(net, 1.0, rules=js.Heat(net, 1.0, 0.01, source=1.0, every=2))
+    state = js.State.from_points(net, net.grid(), temperature=300.0)
+    for dt, n_steps in ((0.1, 11), (0.2, 30), (0.04, 50)):
+        before, state = state, js.rollout(system, state, js.Still(), dt, n_steps).state
+        assert abs(float(state.temperature[0] - before.temperature[0]) - dt * n_steps) <= 2 * dt + 1e-9
+
+
 def test_what_starts_at_the_melting_point_is_solid():
     """Up to the melting point no latent heat has been taken up, above it all; a node at it then melts at a constant temperature."""
     net = js.lattice(3)

@@ -157,7 +157,10 @@ def rollout(
 def _warn(result: Result, dt: Array) -> None:
     """Warn of a dt and a dtype that may be at fault, at the line that called `rollout`."""
     if result.info.stable_dt is not None and bool(result.status.has(Flag.DT_LIMIT)):
-        text = f"dt = {float(dt):.6g} s, but this run is surely stable only up to {float(result.info.stable_dt):.6g} s"
+        limit = float(result.info.stable_dt)
+        text = f"dt = {float(dt):.6g} s, but this run is surely stable only up to {limit:.6g} s"
+        if abs(float(dt)) <= limit:
+            text += " at its start; later the limit fell below dt (`result.status` says where)"
         warnings.warn(f"DT_LIMIT: {EXPLANATION[Flag.DT_LIMIT]}: {text}.", StabilityWarning, stacklevel=3)
     if bool(result.status.has(Flag.PRECISION)):
         warnings.warn(f"PRECISION: {EXPLANATION[Flag.PRECISION]}.", StabilityWarning, stacklevel=3)

@@ -21,7 +21,7 @@ from jaxtyping import Array
 from .._checks import as_inexact, finite, has_shape, nonnegative, positive
 from ..forces.base import Rule, any_refused
 from ..linalg.operators import SpringBlocks
-from ..numerics import cast_inexact, is_traced
+from ..numerics import cast_inexact, is_traced, stopped
 from ..state import State
 from ..status import Flag, Status
 from ..topology.base import Topology
@@ -147,7 +147,7 @@ class Heat(Rule):
         else:
             is_due = self._count(state.time, dt) > self._count(before.time, dt)
             y, status = lax.cond(is_due, lambda y: ready._advanced(flow, y, self.every * dt), lambda y: (y, Status.ok()), y)
-        return _left(flow, y, state), refused.then(status)
+        return _left(flow, y, state), refused.then(status).then(ready._too_long(before, state, dt))
 
     def _count(self, time: Array, dt: Array) -> Array:
         """Heat steps that were due up to a time: they fall on the multiples of every * dt.
@@ -170,18 +170,37 @@ class Heat(Rule):
 
         return lax.scan(substep, (y, Status.ok()), jnp.arange(self.substeps, dtype=dt.dtype))[0]
 
+    def _too_long(self, before: State, state: State, dt: Array) -> Status:
+        """DT_LIMIT where a node has become so hot that `dt` is too long for it; elsewhere the limit is that at the start of the run."""
+        if all(boundary.is_linear for boundary in self.boundaries):
+            return Status.ok()
+        ready, state, dt = stopped((self, dataclasses.replace(state, temperature=before.temperature), dt))
+        rate = ready._rate(state)
+        limit = ready._limit(rate)
+        if limit is None:
+            return Status.ok()
+        # The slack of the check at the start.
+        slack = jnp.asarray(1 + 8 * float(jnp.finfo(limit.dtype).eps), limit.dtype)
+        return Status.when(Flag.DT_LIMIT, jnp.abs(dt) > limit * slack, node=jnp.argmax(jnp.ravel(rate)).astype(jnp.int32))
+
     def limit(self, state: State) -> Array | None:
         """Largest dt [s] of the nodes' steps at which an explicit scheme is stable and makes no new extreme; None for the others."""
         ready = self.prepare(state.dtype)
-        out = ready.net.incident_sum(ready.conductance).astype(state.dtype)
-        for boundary in ready.boundaries:
-            slope = boundary.slope_bound(state, _temperature(state))
-            out = out if slope is None else out + slope
-        rate = out / ready.capacity
-        held = ready.flow(state, cuts=False).held()
-        rate = rate if held is None else jnp.where(held, jnp.zeros_like(rate), rate)
+        return ready._limit(ready._rate(state))
+
+    def _limit(self, rate: Array) -> Array | None:
         limit = self.scheme.limit(jnp.max(rate))
         return None if limit is None else limit * self.substeps / self.every
+
+    def _rate(self, state: State) -> Array:
+        """Share of its heat that each free node gives away per time, at most [1/s]; of a prepared rule."""
+        out = self.net.incident_sum(self.conductance).astype(state.dtype)
+        for boundary in self.boundaries:
+            slope = boundary.slope_bound(state, _temperature(state))
+            out = out if slope is None else out + slope
+        rate = out / self.capacity
+        held = self.flow(state, cuts=False).held()
+        return rate if held is None else jnp.where(held, jnp.zeros_like(rate), rate)
 
     def power(self, state: State) -> Array:
         """Heat per time into each node [W], in node shape: conduction, sources and boundaries."""

@@ -157,6 +157,33 @@ def test_limit_of_an_explicit_step():
     assert float(seldom.limit(state)) == pytest.approx(3 / rate[1:].max(), rel=1e-12)
 
 
+@pytest.mark.slow
+def test_radiation_that_gets_too_hot_for_dt_is_reported():
+    """A step that is short enough at 300 K and too long at 400 K gives DT_LIMIT with step and node, in the rule's name; a short one does
+    not, nor an implicit one, nor a node that is held.
+    """
+    net, hottest = js.lattice(20), np.arange(20) == 7
+    points, source = net.grid(), np.where(hottest, 1000.0, 900.0)
+    start = js.State.from_points(net, points, temperature=300.0)
+
+    def go(scheme, dt, n_steps, *more):
+        boundaries = (js.Radiation(net, np.ones(20, bool), 1.0, 300.0, 1.0), *more)
+        heat = js.Heat(net, 1.0, 0.0, scheme, source=source, boundaries=boundaries)
+        return js.rollout(js.System(net, 1.0, rules=heat), start, js.Still(), dt, n_steps)
+
+    with pytest.warns(js.StabilityWarning, match=r"0.163\d* s at its start; later the limit fell below dt"):
+        long = go(js.ExplicitHeat(), 0.14, 40)
+    assert bool(long.status.has(js.Flag.DT_LIMIT))
+    assert (int(long.status.step), int(long.status.node), int(long.status.effect)) == (2, 7, 0)
+    short = go(js.ExplicitHeat(), 0.03, 1000)
+    assert int(short.status.flags) == 0
+    settled = (source / 5.670374419e-8 + 300.0**4) ** 0.25
+    np.testing.assert_allclose(short.state.temperature, settled, rtol=1e-9)
+    assert int(go(js.BackwardEulerHeat(), 0.14, 40).status.flags) == 0
+    held = go(js.ExplicitHeat(), 0.14, 40, js.FixedTemperature(net, np.ones(20, bool), lambda t: 300.0 + t))
+    assert int(held.status.flags) == 0
+
+
 def test_radiation_pulls_back_below_zero():
     """Below 0 K, where a step too long may lead, the loss is odd: -50 K lacks what 50 K radiates, and the slope is its derivative."""
     net, factor = js.lattice(2), 0.8 * 5.670374419e-8 * 0.5

@@ -12,7 +12,7 @@ Source: Carslaw and Jaeger, Conduction of Heat in Solids (1959), section 1.9.
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax
@@ -40,6 +40,20 @@ class ThermalBoundary(eqx.Module):
     """
 
     is_linear: ClassVar[bool] = False
+
+    def on(self, net: Topology, name: str) -> Self:
+        """The same in a rule on this net; `name` is what it is called in an error.
+
+        Raises:
+            ValueError: nodes that are those of another net.
+        """
+        for mask in (getattr(self, "nodes", None), self.held()):
+            if mask is not None and mask.shape != net.node_shape:
+                raise ValueError(
+                    f"{name} ({type(self).__name__}) names nodes on a net of shape {mask.shape}; expected {net.node_shape}, that of Heat's "
+                    f"net. Unchecked, it would act on other nodes. Build it with the net that you give Heat."
+                )
+        return self
 
     def power(self, state: State, temperature: Array) -> Array | None:
         """Heat per time into each node [W], in node shape, at these temperatures [K]; None where it is none."""

@@ -99,7 +99,7 @@ class Heat(Rule):
         substeps: heat steps in one step of the nodes, of dt / substeps each.
         every: steps of the nodes in one heat step, of every * dt, which falls on the multiples of that on the time axis. In between
             the temperature stands still.
-        latent: melting, with values in node shape.
+        latent: melting; its values are numbers, or (N,) in the user's order.
         cut_by: the system's net, where broken springs are to conduct nothing. On a lattice it must have every family of `net`.
         """
         self.net = net
@@ -110,9 +110,9 @@ class Heat(Rule):
         self.scheme = _kind("scheme", ExplicitHeat() if scheme is None else scheme, HeatScheme)
         self.scheme.check(net)
         given = (boundaries,) if isinstance(boundaries, ThermalBoundary) else tuple(boundaries)
-        self.boundaries = tuple(_kind(f"boundaries[{i}]", b, ThermalBoundary) for i, b in enumerate(given))
+        self.boundaries = tuple(_kind(f"boundaries[{i}]", b, ThermalBoundary).on(net, f"boundaries[{i}]") for i, b in enumerate(given))
         self.source = source if source is None or callable(source) else _source(net, source)
-        self.latent = None if latent is None else _kind("latent", latent, LatentHeat)
+        self.latent = None if latent is None else _kind("latent", latent, LatentHeat).on(net)
         for name, count in (("substeps", substeps), ("every", every)):
             if isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 1:
                 raise ValueError(f"{name} = {count!r}; expected a whole number, 1 or more.")

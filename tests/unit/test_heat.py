@@ -295,6 +295,38 @@ def test_refusals():
         js.System(net, 1.0, rules=js.Heat(net, 1.0, 1.0)).begin(wet)
 
 
+def test_fields_of_another_shape_are_refused():
+    """Areas, melting points and masks that are not those of the net would broadcast along an axis of a lattice: each is an error."""
+    net, chain = js.lattice((4, 4)), js.lattice(4)
+
+    def plane(area):
+        return js.HotPlane((0.0, 0.0), (0.0, 1.0), 400.0, 5.0, area, reach=1.0)
+
+    for match, more in [
+        (r"boundaries\[0\]\.area has shape \(4,\); expected .*\(16,\)", {"boundaries": plane(np.arange(4.0))}),
+        (r"latent\.melting has shape \(4,\)", {"latent": js.LatentHeat([290.0, 310.0, 350.0, 400.0], 1.0)}),
+        (r"latent\.latent has shape \(4,\)", {"latent": js.LatentHeat(290.0, np.ones(4))}),
+        (
+            r"boundaries\[1\] \(FixedTemperature\) names nodes on a net of shape \(4,\); expected \(4, 4\)",
+            {"boundaries": (plane(1.0), js.FixedTemperature(chain, np.arange(4) < 1, 400.0))},
+        ),
+        (r"\(HeatFlux\) names nodes", {"boundaries": js.HeatFlux(chain, np.arange(4) < 1, 1.0, 1.0)}),
+    ]:
+        with pytest.raises(ValueError, match=match):
+            js.Heat(net, 1.0, 1.0, **more)
+
+
+@pytest.mark.parametrize("net", [js.lattice((2, 2)), js.Graph.from_edges([(3, 0), (0, 2), (2, 1)], 4)], ids=["lattice", "graph"])
+def test_areas_and_melting_points_are_in_the_users_order(net):
+    """A plane with one area per node, and a melting point per node, act on the nodes that the user numbered."""
+    area, melting = np.array([1.0, 2.0, 3.0, 4.0]), np.array([290.0, 310.0, 350.0, 400.0])
+    plane = js.HotPlane((0.0, 0.0), (0.0, 1.0), 400.0, 5.0, area, reach=9.0)
+    heat = js.Heat(net, 1.0, 0.0, boundaries=plane, latent=js.LatentHeat(melting, area))
+    state = js.State.from_points(net, np.zeros((4, 2)), temperature=320.0)
+    np.testing.assert_allclose(net.flatten_nodes(heat.power(state)), 5.0 * area * 80.0, rtol=1e-14)
+    np.testing.assert_array_equal(net.flatten_nodes(heat.begin(state).enthalpy), [1.0, 2.0, 0.0, 0.0])
+
+
 def test_a_bad_constant_that_slipped_in_is_reported():
     """A negative capacity put in after construction, and a step backward in time, give INVALID."""
     net = js.lattice(3)

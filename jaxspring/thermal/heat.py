@@ -120,6 +120,11 @@ class Heat(Rule):
         self.cut_by = cut_by
         self.families = None if cut_by is None else _shared_families(net, cut_by)
 
+    @property
+    def sets_temperature(self) -> bool:
+        """Yes."""
+        return True
+
     def begin(self, state: State) -> State:
         """The state with given temperatures in their place and, with latent heat, an enthalpy.
 

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._checks import as_inexact, finite, has_shape, nonnegative
+from .._checks import as_inexact, finite, has_shape, is_concrete, nonnegative
 from ..forces.base import any_refused
 from ..state import State
 from ..topology.base import Topology
@@ -225,7 +225,7 @@ class Radiation(ThermalBoundary):
         area: surface of each node [m^2], a number or a node array.
 
     Raises:
-        ValueError: a wrong shape, a negative emissivity or area, a temperature that is not finite.
+        ValueError: a wrong shape, an emissivity below 0 or above 1, a negative area, a temperature that is not finite.
         TypeError: `nodes` that is not boolean.
     """
 
@@ -240,12 +240,17 @@ class Radiation(ThermalBoundary):
         Args:
         net: the topology.
         nodes: (N,) booleans in the user's order.
-        emissivity: a number, or (N,) in the user's order.
+        emissivity: between 0 and 1: a number, or (N,) in the user's order.
         ambient: [K]: a number, (N,) in the user's order, or a function of time [s] that gives a number or a node array.
         area: [m^2]: a number, or (N,) in the user's order.
         """
         self.nodes = _mask(net, nodes)
         self.emissivity = _nonnegative(net, "emissivity", emissivity)
+        if is_concrete(self.emissivity) and bool(jnp.any(self.emissivity > 1)):
+            raise ValueError(
+                f"emissivity = {float(jnp.max(self.emissivity))}, but must be between 0 and 1: no surface radiates more than a black one. "
+                f"Pass a larger area if that is meant."
+            )
         self.ambient = _given(net, "ambient", ambient)
         self.area = _nonnegative(net, "area", area)
 
@@ -270,8 +275,8 @@ class Radiation(ThermalBoundary):
         return _there(self.nodes, STEFAN_BOLTZMANN * self.emissivity * self.area, like)
 
     def invalid(self) -> Array:
-        """Whether the emissivity or the area is negative or not finite."""
-        return any_refused(self.emissivity, self.area)
+        """Whether the emissivity is not between 0 and 1, or the area negative or not finite."""
+        return any_refused(self.emissivity, self.area) | jnp.any(self.emissivity > 1)
 
 
 def at_time(value: Given, time: Array, like: Array) -> Array:

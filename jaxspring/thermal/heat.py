@@ -10,6 +10,7 @@ Source: slides "Heating and Melting", "Heat Equation (Discretised)".
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable
 from typing import Any
 
 import equinox as eqx
@@ -109,7 +110,7 @@ class Heat(Rule):
         self.conductance = _conductance(net, conductance)
         self.scheme = _kind("scheme", ExplicitHeat() if scheme is None else scheme, HeatScheme)
         self.scheme.check(net)
-        given = (boundaries,) if isinstance(boundaries, ThermalBoundary) else tuple(boundaries)
+        given = tuple(boundaries) if isinstance(boundaries, Iterable) else (boundaries,)
         self.boundaries = tuple(_kind(f"boundaries[{i}]", b, ThermalBoundary).on(net, f"boundaries[{i}]") for i, b in enumerate(given))
         self.source = source if source is None or callable(source) else _source(net, source)
         self.latent = None if latent is None else _kind("latent", latent, LatentHeat).on(net)
@@ -306,6 +307,8 @@ def _source(net: Topology, value: Any) -> Array:
 
 
 def _kind(name: str, value: Any, kind: type) -> Any:
+    if isinstance(value, type) and issubclass(value, kind):
+        raise TypeError(f"{name} is the class {value.__name__} itself; expected an object of it: write {value.__name__}(...).")
     if not isinstance(value, kind):
         raise TypeError(f"{name} is a {type(value).__name__}; expected a {kind.__name__}.")
     return value

@@ -168,7 +168,8 @@ def raise_for_status(result: Any) -> None:
     note = getattr(result, "effects", ())
     if not bool(np.all(np.asarray(status.is_ok))):
         hint = getattr(getattr(result, "info", None), "stable_dt", None)
-        limit = "" if hint is None else f" The stability limit of this run was dt = {float(np.min(np.asarray(hint))):.6g}."
+        is_limited = hint is not None and bool(np.all(np.isfinite(np.asarray(hint))))
+        limit = f" The stability limit of this run was dt = {float(np.min(np.asarray(hint))):.6g}." if is_limited else ""
         raise SimulationError(status.describe(note) + "." + limit)
     if bool(np.any(np.asarray(status.flags) != 0)):
         warnings.warn(status.describe(note), StabilityWarning, stacklevel=2)

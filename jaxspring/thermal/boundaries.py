@@ -105,9 +105,9 @@ class FixedTemperature(ThermalBoundary):
         """Check what is given, and bring it to the shape of the net.
 
         Args:
-        net: the topology.
-        nodes: (N,) booleans in the user's order.
-        temperature: [K]: a number, (N,) in the user's order, or a function of time [s] that gives a number or a node array.
+            net: the topology.
+            nodes: (N,) booleans in the user's order.
+            temperature: [K]: a number, (N,) in the user's order, or a function of time [s] that gives a number or a node array.
         """
         self.nodes = _mask(net, nodes)
         self.temperature = _given(net, "temperature", temperature)
@@ -143,10 +143,10 @@ class HeatFlux(ThermalBoundary):
         """Check what is given, and bring it to the shape of the net.
 
         Args:
-        net: the topology.
-        nodes: (N,) booleans in the user's order.
-        flux: [W/m^2]: a number, (N,) in the user's order, or a function of time [s] that gives a number or a node array.
-        area: [m^2]: a number, or (N,) in the user's order.
+            net: the topology.
+            nodes: (N,) booleans in the user's order.
+            flux: [W/m^2]: a number, (N,) in the user's order, or a function of time [s] that gives a number or a node array.
+            area: [m^2]: a number, or (N,) in the user's order.
         """
         self.nodes = _mask(net, nodes)
         self.flux = _given(net, "flux", flux)
@@ -188,11 +188,11 @@ class Convection(ThermalBoundary):
         """Check what is given, and bring it to the shape of the net.
 
         Args:
-        net: the topology.
-        nodes: (N,) booleans in the user's order.
-        coefficient: [W/(m^2 K)]: a number, or (N,) in the user's order.
-        ambient: [K]: a number, (N,) in the user's order, or a function of time [s] that gives a number or a node array.
-        area: [m^2]: a number, or (N,) in the user's order.
+            net: the topology.
+            nodes: (N,) booleans in the user's order.
+            coefficient: [W/(m^2 K)]: a number, or (N,) in the user's order.
+            ambient: [K]: a number, (N,) in the user's order, or a function of time [s] that gives a number or a node array.
+            area: [m^2]: a number, or (N,) in the user's order.
         """
         self.nodes = _mask(net, nodes)
         self.coefficient = _nonnegative(net, "coefficient", coefficient)
@@ -200,11 +200,11 @@ class Convection(ThermalBoundary):
         self.area = _nonnegative(net, "area", area)
 
     def power(self, state: State, temperature: Array) -> Array:
-        """H A (theta_a - theta) [W]."""
+        """Heat per time h A (theta_a - theta) [W]."""
         return self._conductance(temperature) * (at_time(self.ambient, state.time, temperature) - temperature)
 
     def slope(self, state: State, temperature: Array) -> Array:
-        """H A [W/K]."""
+        """Coefficient times area, h A [W/K]."""
         return self._conductance(temperature)
 
     def _conductance(self, like: Array) -> Array:
@@ -238,11 +238,11 @@ class Radiation(ThermalBoundary):
         """Check what is given, and bring it to the shape of the net.
 
         Args:
-        net: the topology.
-        nodes: (N,) booleans in the user's order.
-        emissivity: between 0 and 1: a number, or (N,) in the user's order.
-        ambient: [K]: a number, (N,) in the user's order, or a function of time [s] that gives a number or a node array.
-        area: [m^2]: a number, or (N,) in the user's order.
+            net: the topology.
+            nodes: (N,) booleans in the user's order.
+            emissivity: between 0 and 1: a number, or (N,) in the user's order.
+            ambient: [K]: a number, (N,) in the user's order, or a function of time [s] that gives a number or a node array.
+            area: [m^2]: a number, or (N,) in the user's order.
         """
         self.nodes = _mask(net, nodes)
         self.emissivity = _nonnegative(net, "emissivity", emissivity)
@@ -255,7 +255,7 @@ class Radiation(ThermalBoundary):
         self.area = _nonnegative(net, "area", area)
 
     def power(self, state: State, temperature: Array) -> Array:
-        """E sigma A (theta_a^4 - theta^3 abs(theta)) [W]."""
+        """Heat per time e sigma A (theta_a^4 - theta^3 abs(theta)) [W]."""
         ambient = at_time(self.ambient, state.time, temperature)
         # A product of differences: no digit is lost where the two are near.
         difference = (ambient - temperature) * (ambient + temperature) * (ambient**2 + temperature**2)
@@ -264,7 +264,7 @@ class Radiation(ThermalBoundary):
         return self._factor(temperature) * difference
 
     def slope(self, state: State, temperature: Array) -> Array:
-        """4 e sigma A theta^3 [W/K]."""
+        """Derivative 4 e sigma A theta^3 [W/K]."""
         return self._factor(temperature) * 4 * jnp.abs(temperature) ** 3
 
     def slope_bound(self, state: State, temperature: Array) -> Array:

@@ -91,17 +91,17 @@ class Heat(Rule):
         """Check what is given, and bring it to the shape of the net.
 
         Args:
-        net: the topology along which heat flows.
-        capacity: [J/K]: a number, or (N,) in the user's order; see `capacities`.
-        conductance: [W/K]: a number, (E,) in the user's order, or an edge field; see `conductances`.
-        scheme: `ExplicitHeat()` unless said.
-        boundaries: one or several; where none is named the body is insulated.
-        source: [W]: a number, (N,) in the user's order, or a function of time [s] that gives a number or a node array.
-        substeps: heat steps in one step of the nodes, of dt / substeps each.
-        every: steps of the nodes in one heat step, of every * dt, which falls on the multiples of that on the time axis. In between
-            the temperature stands still.
-        latent: melting; its values are numbers, or (N,) in the user's order.
-        cut_by: the system's net, where broken springs are to conduct nothing. On a lattice it must have every family of `net`.
+            net: the topology along which heat flows.
+            capacity: [J/K]: a number, or (N,) in the user's order; see `capacities`.
+            conductance: [W/K]: a number, (E,) in the user's order, or an edge field; see `conductances`.
+            scheme: `ExplicitHeat()` unless said.
+            boundaries: one or several; where none is named the body is insulated.
+            source: [W]: a number, (N,) in the user's order, or a function of time [s] that gives a number or a node array.
+            substeps: heat steps in one step of the nodes, of dt / substeps each.
+            every: steps of the nodes in one heat step, of every * dt, which falls on the multiples of that on the time axis. In between
+                the temperature stands still.
+            latent: melting; its values are numbers, or (N,) in the user's order.
+            cut_by: the system's net, where broken springs are to conduct nothing. On a lattice it must have every family of `net`.
         """
         self.net = net
         capacity = as_inexact("capacity", capacity)

@@ -53,13 +53,13 @@ class HotPlane(ThermalBoundary):
         """Check what is given.
 
         Args:
-        point: (D,) [m].
-        normal: (D,), of any length.
-        temperature: [K].
-        coefficient: [W/(m^2 K)].
-        area: [m^2]: a number, or (N,) in the user's order.
-        reach: [m].
-        fade: [m].
+            point: (D,) [m].
+            normal: (D,), of any length.
+            temperature: [K].
+            coefficient: [W/(m^2 K)].
+            area: [m^2]: a number, or (N,) in the user's order.
+            reach: [m].
+            fade: [m].
         """
         self.point, self.normal = plane(point, normal)
         self.temperature = temperature if callable(temperature) else as_inexact("temperature", temperature)
@@ -94,15 +94,15 @@ class HotPlane(ThermalBoundary):
         return jnp.where(fades, ramp, jnp.where(beyond <= 0, one, zero))
 
     def power(self, state: State, temperature: Array) -> Array:
-        """W h A (theta_plane - theta) [W]."""
+        """Heat per time w h A (theta_plane - theta) [W]."""
         return self.slope(state, temperature) * (at_time(self.temperature, state.time, temperature) - temperature)
 
     def slope(self, state: State, temperature: Array) -> Array:
-        """W h A [W/K]."""
+        """Contact times coefficient times area, w h A [W/K]."""
         return self.contact(state) * self.coefficient * self.area
 
     def slope_bound(self, state: State, temperature: Array) -> Array:
-        """H A, as if all nodes touched [W/K]."""
+        """Coefficient times area, as if all nodes touched [W/K]."""
         return jnp.broadcast_to(self.coefficient * self.area, temperature.shape)
 
     def invalid(self) -> Array:

@@ -157,6 +157,14 @@ def test_limit_of_an_explicit_step():
     assert float(seldom.limit(state)) == pytest.approx(3 / rate[1:].max(), rel=1e-12)
 
 
+def test_nothing_limits_implicit_heat_of_nodes_that_stand_still():
+    """`stable_dt` with `Still` is infinite where heat is implicit, or there is none, and that of heat where it is explicit."""
+    net = js.lattice(3)
+    state = js.State.from_points(net, net.grid(), temperature=300.0)
+    for rules, expected in ((js.Heat(net, 1.0, 2.0, js.BackwardEulerHeat()), np.inf), ((), np.inf), (js.Heat(net, 1.0, 2.0), 0.25)):
+        assert float(js.stable_dt(js.System(net, 1.0, rules=rules), state, js.Still())) == expected
+
+
 @pytest.mark.slow
 def test_radiation_that_gets_too_hot_for_dt_is_reported():
     """A step that is short enough at 300 K and too long at 400 K gives DT_LIMIT with step and node, in the rule's name; a short one does

@@ -162,8 +162,9 @@ def _warn(result: Result, dt: Array) -> None:
             text = f"{EXPLANATION[Flag.DT_LIMIT]}: dt = {float(dt):.6g} s, but this run is surely stable only up to {limit:.6g} s"
         else:
             text = (
-                f"particles moved or met too fast for dt = {float(dt):.6g} s, which was below stable_dt at the start: one went in a step "
-                f"farther than half the list's skin, or dt is above the fluid's collision_dt. Lower dt, or widen the skin"
+                f"dt = {float(dt):.6g} s was below stable_dt at the start, but later the limit fell below it (`result.status` says where): "
+                f"particles moved or met too fast, farther in a step than half the list's skin or for the fluid's collision_dt, or a "
+                f"node became too hot. Lower dt, or widen the skin"
             )
         warnings.warn(f"DT_LIMIT: {text}.", StabilityWarning, stacklevel=3)
     if bool(result.status.has(Flag.PRECISION)):

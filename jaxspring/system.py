@@ -98,9 +98,9 @@ class System(eqx.Module):
         positive("mass", mass, "A node without mass would get an infinite acceleration.")
         self.net = net
         self.mass = net.node_field(mass, "mass")
-        self.forces = tuple(self._adopt(i, f) for i, f in enumerate((forces,) if isinstance(forces, Force) else forces))
+        self.forces = tuple(self._adopt(i, f) for i, f in enumerate(forces if isinstance(forces, Iterable) else (forces,)))
         # None, not an empty tuple, which some transformations of equinox and diffrax mistake for an array.
-        self.rules = tuple(self._adopt_rule(i, r) for i, r in enumerate((rules,) if isinstance(rules, Rule) else rules)) or None
+        self.rules = tuple(self._adopt_rule(i, r) for i, r in enumerate(rules if isinstance(rules, Iterable) else (rules,))) or None
         self.free = _as_free(net, free)
         self.motion = motion
 
@@ -109,6 +109,8 @@ class System(eqx.Module):
         return cast_inexact(effect.with_mass(self.mass).with_forces(self.forces), state.dtype)
 
     def _adopt(self, i: int, force: Any) -> Force:
+        if isinstance(force, Rule) and not isinstance(force, Force):
+            raise TypeError(f"forces[{i}] is a {type(force).__name__}, which is a rule and no force. Pass it in rules=.")
         if not isinstance(force, Force):
             raise TypeError(f"forces[{i}] is a {type(force).__name__}; expected a Force, e.g. Springs(net, ...) or Drag(gamma).")
         return self._on_this_net(f"forces[{i}]", force)

@@ -7,6 +7,7 @@ from its start, up to the step.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -122,7 +123,7 @@ def settle(advance: Callable[[Carry], Carry], first: Carry, status: Status, syst
             (first, first),
         )
         node = jnp.argmax(jnp.ravel(_nonfinite(failed.state)))
-        return failed.step, node.astype(jnp.int32), _blame(system, last.state)
+        return failed.step, node.astype(jnp.int32), _blame(system, last.state, failed.state)
 
     has_failed = status.has(Flag.NONFINITE) & (status.step > 0)
     known = (status.step, status.node, status.effect)
@@ -130,9 +131,15 @@ def settle(advance: Callable[[Carry], Carry], first: Carry, status: Status, syst
     return lax.stop_gradient(Status(status.flags, step, node, effect, status.count))
 
 
-def _blame(system: System, state: State) -> Array:
-    """Index of the first effect whose force is not finite in this state, else -1."""
+def _blame(system: System, state: State, failed: State) -> Array:
+    """Index of the first force that is not finite in this state; else, where only temperatures failed in the next, of the first rule
+    that sets them; else -1.
+    """
     effect = jnp.asarray(NOWHERE, jnp.int32)
+    heaters = [i for i, part in enumerate(system.parts) if part.sets_temperature]
+    if heaters:
+        moves_on = ~jnp.any(_nonfinite(replace(failed, temperature=None)))
+        effect = jnp.where(moves_on, jnp.asarray(heaters[0], jnp.int32), effect)
     for i, force in reversed(list(enumerate(system.forces))):
         bad = jnp.any(jnp.stack([~jnp.all(jnp.isfinite(a)) for a in force.force(state)]))
         effect = jnp.where(bad, jnp.asarray(i, jnp.int32), effect)

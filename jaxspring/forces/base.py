@@ -49,6 +49,11 @@ class Rule(eqx.Module):
         """Whether its shifts of nodes only put back what the step has carried too far: a `Ledger` books them with the step."""
         return False
 
+    @property
+    def sets_temperature(self) -> bool:
+        """Whether it changes temperatures: it is named where one is NaN or infinite."""
+        return False
+
     def begin(self, state: State) -> State:
         """The state with the memory that this rule needs, made where it is not there yet. Called before the first step."""
         return state

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..state import State
@@ -18,6 +19,10 @@ class Still(Stepper):
     def step(self, system: System, state: State, dt: Array, memory: None) -> tuple[State, None]:
         """The same state."""
         return state, None
+
+    def limit(self, squared_frequency: Array, damping: Array, damping_floor: Array) -> Array:
+        """Infinite: only rules limit dt."""
+        return jnp.full_like(squared_frequency, jnp.inf)
 
 
 __all__ = ["Still"]

@@ -73,7 +73,7 @@ class BackwardStep(ImplicitProblem):
     iteration: HeatIteration
 
     def solve(self, flow: Flow, start: Array, dt: Array) -> tuple[Array, Status]:
-        """Y at the end of a step of dt [s], and how it was found; `flow` is at the end of the step."""
+        """The unknown y at the end of a step of dt [s], and how it was found; `flow` is at the end of the step."""
         equation = Equation(flow, start, dt, jnp.ones((), start.dtype))
         still = stopped(equation)
         first = still.flow.hold(still.start)
@@ -89,7 +89,7 @@ class BackwardStep(ImplicitProblem):
         return balanced(equation, implicitly(self, equation, stand.y)), status
 
     def residual(self, equation: Equation, y: Array) -> Array:
-        """-r(y) where free, y less what is given elsewhere."""
+        """Minus r(y) where free, y less what is given elsewhere."""
         held = equation.flow.held()
         missing = -equation.missing(y)
         return missing if held is None else jnp.where(held, y - equation.flow.hold(y), missing)
@@ -161,7 +161,7 @@ class BackwardStep(ImplicitProblem):
 
 
 def balanced(equation: Equation, y: Array) -> Array:
-    """Y raised by one number, so that the nodes' balances add up to zero."""
+    """The unknown y raised by one number, so that the nodes' balances add up to zero."""
     flow = equation.flow
     held, melting = flow.held(), flow.is_melting(y)
     one, zero = jnp.ones_like(y), jnp.zeros_like(y)

@@ -12,7 +12,7 @@ Source: Carslaw and Jaeger, Conduction of Heat in Solids (1959), section 1.9.
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax
@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._checks import as_inexact, finite, has_shape, nonnegative
+from .._checks import as_inexact, finite, has_shape, is_concrete, nonnegative
 from ..forces.base import any_refused
 from ..state import State
 from ..topology.base import Topology
@@ -40,6 +40,20 @@ class ThermalBoundary(eqx.Module):
     """
 
     is_linear: ClassVar[bool] = False
+
+    def on(self, net: Topology, name: str) -> Self:
+        """The same in a rule on this net; `name` is what it is called in an error.
+
+        Raises:
+            ValueError: nodes that are those of another net.
+        """
+        for mask in (getattr(self, "nodes", None), self.held()):
+            if mask is not None and mask.shape != net.node_shape:
+                raise ValueError(
+                    f"{name} ({type(self).__name__}) names nodes on a net of shape {mask.shape}; expected {net.node_shape}, that of Heat's "
+                    f"net. Unchecked, it would act on other nodes. Build it with the net that you give Heat."
+                )
+        return self
 
     def power(self, state: State, temperature: Array) -> Array | None:
         """Heat per time into each node [W], in node shape, at these temperatures [K]; None where it is none."""
@@ -91,9 +105,9 @@ class FixedTemperature(ThermalBoundary):
         """Check what is given, and bring it to the shape of the net.
 
         Args:
-        net: the topology.
-        nodes: (N,) booleans in the user's order.
-        temperature: [K]: a number, (N,) in the user's order, or a function of time [s] that gives a number or a node array.
+            net: the topology.
+            nodes: (N,) booleans in the user's order.
+            temperature: [K]: a number, (N,) in the user's order, or a function of time [s] that gives a number or a node array.
         """
         self.nodes = _mask(net, nodes)
         self.temperature = _given(net, "temperature", temperature)
@@ -129,10 +143,10 @@ class HeatFlux(ThermalBoundary):
         """Check what is given, and bring it to the shape of the net.
 
         Args:
-        net: the topology.
-        nodes: (N,) booleans in the user's order.
-        flux: [W/m^2]: a number, (N,) in the user's order, or a function of time [s] that gives a number or a node array.
-        area: [m^2]: a number, or (N,) in the user's order.
+            net: the topology.
+            nodes: (N,) booleans in the user's order.
+            flux: [W/m^2]: a number, (N,) in the user's order, or a function of time [s] that gives a number or a node array.
+            area: [m^2]: a number, or (N,) in the user's order.
         """
         self.nodes = _mask(net, nodes)
         self.flux = _given(net, "flux", flux)
@@ -174,11 +188,11 @@ class Convection(ThermalBoundary):
         """Check what is given, and bring it to the shape of the net.
 
         Args:
-        net: the topology.
-        nodes: (N,) booleans in the user's order.
-        coefficient: [W/(m^2 K)]: a number, or (N,) in the user's order.
-        ambient: [K]: a number, (N,) in the user's order, or a function of time [s] that gives a number or a node array.
-        area: [m^2]: a number, or (N,) in the user's order.
+            net: the topology.
+            nodes: (N,) booleans in the user's order.
+            coefficient: [W/(m^2 K)]: a number, or (N,) in the user's order.
+            ambient: [K]: a number, (N,) in the user's order, or a function of time [s] that gives a number or a node array.
+            area: [m^2]: a number, or (N,) in the user's order.
         """
         self.nodes = _mask(net, nodes)
         self.coefficient = _nonnegative(net, "coefficient", coefficient)
@@ -186,11 +200,11 @@ class Convection(ThermalBoundary):
         self.area = _nonnegative(net, "area", area)
 
     def power(self, state: State, temperature: Array) -> Array:
-        """H A (theta_a - theta) [W]."""
+        """Heat per time h A (theta_a - theta) [W]."""
         return self._conductance(temperature) * (at_time(self.ambient, state.time, temperature) - temperature)
 
     def slope(self, state: State, temperature: Array) -> Array:
-        """H A [W/K]."""
+        """Coefficient times area, h A [W/K]."""
         return self._conductance(temperature)
 
     def _conductance(self, like: Array) -> Array:
@@ -211,7 +225,7 @@ class Radiation(ThermalBoundary):
         area: surface of each node [m^2], a number or a node array.
 
     Raises:
-        ValueError: a wrong shape, a negative emissivity or area, a temperature that is not finite.
+        ValueError: a wrong shape, an emissivity below 0 or above 1, a negative area, a temperature that is not finite.
         TypeError: `nodes` that is not boolean.
     """
 
@@ -224,19 +238,24 @@ class Radiation(ThermalBoundary):
         """Check what is given, and bring it to the shape of the net.
 
         Args:
-        net: the topology.
-        nodes: (N,) booleans in the user's order.
-        emissivity: a number, or (N,) in the user's order.
-        ambient: [K]: a number, (N,) in the user's order, or a function of time [s] that gives a number or a node array.
-        area: [m^2]: a number, or (N,) in the user's order.
+            net: the topology.
+            nodes: (N,) booleans in the user's order.
+            emissivity: between 0 and 1: a number, or (N,) in the user's order.
+            ambient: [K]: a number, (N,) in the user's order, or a function of time [s] that gives a number or a node array.
+            area: [m^2]: a number, or (N,) in the user's order.
         """
         self.nodes = _mask(net, nodes)
         self.emissivity = _nonnegative(net, "emissivity", emissivity)
+        if is_concrete(self.emissivity) and bool(jnp.any(self.emissivity > 1)):
+            raise ValueError(
+                f"emissivity = {float(jnp.max(self.emissivity))}, but must be between 0 and 1: no surface radiates more than a black one. "
+                f"Pass a larger area if that is meant."
+            )
         self.ambient = _given(net, "ambient", ambient)
         self.area = _nonnegative(net, "area", area)
 
     def power(self, state: State, temperature: Array) -> Array:
-        """E sigma A (theta_a^4 - theta^3 abs(theta)) [W]."""
+        """Heat per time e sigma A (theta_a^4 - theta^3 abs(theta)) [W]."""
         ambient = at_time(self.ambient, state.time, temperature)
         # A product of differences: no digit is lost where the two are near.
         difference = (ambient - temperature) * (ambient + temperature) * (ambient**2 + temperature**2)
@@ -245,7 +264,7 @@ class Radiation(ThermalBoundary):
         return self._factor(temperature) * difference
 
     def slope(self, state: State, temperature: Array) -> Array:
-        """4 e sigma A theta^3 [W/K]."""
+        """Derivative 4 e sigma A theta^3 [W/K]."""
         return self._factor(temperature) * 4 * jnp.abs(temperature) ** 3
 
     def slope_bound(self, state: State, temperature: Array) -> Array:
@@ -256,8 +275,8 @@ class Radiation(ThermalBoundary):
         return _there(self.nodes, STEFAN_BOLTZMANN * self.emissivity * self.area, like)
 
     def invalid(self) -> Array:
-        """Whether the emissivity or the area is negative or not finite."""
-        return any_refused(self.emissivity, self.area)
+        """Whether the emissivity is not between 0 and 1, or the area negative or not finite."""
+        return any_refused(self.emissivity, self.area) | jnp.any(self.emissivity > 1)
 
 
 def at_time(value: Given, time: Array, like: Array) -> Array:

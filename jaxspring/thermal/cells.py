@@ -46,7 +46,7 @@ class Cells(eqx.Module):
         """
         net = on_lattice(net)
         steps = spacings(net, spacing)
-        volume = jnp.asarray(section, steps[0].dtype) * math.prod(steps[1:], start=steps[0])
+        volume = section_of(section).astype(steps[0].dtype) * math.prod(steps[1:], start=steps[0])
         return volume * jnp.asarray(self.shares(net, range(len(net.shape))), volume.dtype).ravel()
 
     def shares(self, net: Lattice, axes: Any) -> np.ndarray:
@@ -91,7 +91,7 @@ def capacities(net: Topology, density: Any, specific_heat: Any, spacing: Any, se
         cells: `EqualCells()` unless said. Take the same for `conductances`.
 
     Raises:
-        ValueError: a value that is not positive, a shape that does not fit, a net that is no lattice.
+        ValueError: a value or section that is not positive, a shape that does not fit, a net that is no lattice.
 
     >>> import jaxspring as js
     >>> print(capacities(js.lattice((2, 2)), density=1000.0, specific_heat=4.0, spacing=0.1, section=0.01))
@@ -125,4 +125,12 @@ def spacings(net: Lattice, spacing: Any) -> tuple[Array, ...]:
     return tuple(spacing if spacing.ndim == 0 else spacing[dim - 1 - axis] for axis in range(dim))
 
 
-__all__ = ["Cells", "EqualCells", "HalfCells", "capacities", "on_lattice", "spacings"]
+def section_of(section: Any) -> Array:
+    """What the lattice's dimensions lack of a volume, which must be one positive number."""
+    section = as_inexact("section", section)
+    has_shape("section", section, {"one number": ()})
+    positive("section", section, "A cell would have no volume.")
+    return section
+
+
+__all__ = ["Cells", "EqualCells", "HalfCells", "capacities", "on_lattice", "section_of", "spacings"]

@@ -27,7 +27,7 @@ from .._checks import as_inexact, has_shape, nonnegative, positive
 from ..topology.base import Topology
 from ..topology.edge_field import EdgeField
 from ..topology.lattice import Lattice
-from .cells import Cells, EqualCells, on_lattice, spacings
+from .cells import Cells, EqualCells, on_lattice, section_of, spacings
 
 
 def harmonic_mean(net: Topology, value: Any, name: str = "value") -> EdgeField:
@@ -94,8 +94,8 @@ def conductances(net: Topology, conductivity: Any, spacing: Any, section: Any = 
         cells: `EqualCells()` unless said. Take the same for `capacities`.
 
     Raises:
-        ValueError: a negative or infinite conductivity; a tensor that is not symmetric, or that needs a negative conductance or springs
-            that the net lacks; a net that is no lattice.
+        ValueError: a negative or infinite conductivity; a section that is not one positive number; a tensor that is not symmetric, or
+            that needs a negative conductance or springs that the net lacks; a net that is no lattice.
 
     >>> import jaxspring as js
     >>> net = js.lattice((2, 2))
@@ -106,7 +106,7 @@ def conductances(net: Topology, conductivity: Any, spacing: Any, section: Any = 
     conductivity = as_inexact("conductivity", conductivity)
     dim, steps = len(net.shape), spacings(net, spacing)
     cells = EqualCells() if cells is None else cells
-    volume = jnp.asarray(section, steps[0].dtype) * math.prod(steps[1:], start=steps[0])
+    volume = section_of(section).astype(steps[0].dtype) * math.prod(steps[1:], start=steps[0])
     if conductivity.shape[-2:] == (dim, dim) and conductivity.ndim in (2, 3) and dim > 1:
         per_axis, per_diagonal = _of_tensor(net, conductivity, steps)
     else:
@@ -134,7 +134,7 @@ def _of_tensor(net: Lattice, tensor: Array, steps: tuple[Array, ...]) -> tuple[l
     """Conductance over volume [W/(K m^3)] at each node: along the axes, and along the rising and falling diagonals of each plane."""
     dim = len(steps)
     has_shape("conductivity", tensor, {"a tensor": (dim, dim), "one per node": (net.n_nodes, dim, dim)})
-    if not isinstance(tensor, Tracer) and not np.allclose(tensor, np.swapaxes(tensor, -1, -2), rtol=1e-6):
+    if not isinstance(tensor, Tracer) and not _is_symmetric(np.asarray(tensor)):
         raise ValueError("conductivity is not symmetric: the tensor of heat conduction must be. Pass (C + C.T) / 2 if that is meant.")
     # The tensor counts x, y, z; the array's axes run the other way.
     scaled = {
@@ -161,6 +161,12 @@ def _of_tensor(net: Lattice, tensor: Array, steps: tuple[Array, ...]) -> tuple[l
                     f"Build it with STRUCTURAL + SHEAR."
                 )
     return per_axis, per_diagonal
+
+
+def _is_symmetric(tensor: np.ndarray) -> bool:
+    """Whether each tensor is, to a millionth of its largest entry, whatever its unit."""
+    largest = np.max(np.abs(tensor), axis=(-2, -1), keepdims=True)
+    return bool(np.all(np.abs(tensor - np.swapaxes(tensor, -1, -2)) <= 1e-6 * largest))
 
 
 __all__ = ["conductances", "harmonic_mean", "link_conductances"]

@@ -61,7 +61,7 @@ class Flow(eqx.Module):
         return total
 
     def hold(self, y: Array) -> Array:
-        """Y with the given temperatures in their place."""
+        """The unknown y with the given temperatures in their place."""
         held = self.held()
         if held is None:
             return y
@@ -72,7 +72,7 @@ class Flow(eqx.Module):
         return jnp.where(held, self.entered(given, None), y)
 
     def entered(self, temperature: Array, enthalpy: Array | None) -> Array:
-        """Y [K] of these temperatures [K] and latent heats [J] (None: by the temperature)."""
+        """The unknown y [K] of these temperatures [K] and latent heats [J] (None: by the temperature)."""
         if self.latent is None:
             return temperature
         taken_up = self.latent.taken_up(temperature) if enthalpy is None else enthalpy
@@ -112,7 +112,7 @@ class Flow(eqx.Module):
         return total
 
     def matrix(self, y: Array, dt: Any) -> SpringMatrix:
-        """C + dt (slopes + conductances) [J/K] over the nodes whose temperature is free to change, identity for the others."""
+        """The matrix C + dt (slopes + conductances) [J/K] over the nodes whose temperature is free to change, identity for the others."""
         temperature = self.temperature(y)
         diagonal, slope = self.capacity, self.slope(temperature)
         if slope is not None:

@@ -10,6 +10,7 @@ Source: slides "Heating and Melting", "Heat Equation (Discretised)".
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable
 from typing import Any
 
 import equinox as eqx
@@ -21,7 +22,7 @@ from jaxtyping import Array
 from .._checks import as_inexact, finite, has_shape, nonnegative, positive
 from ..forces.base import Rule, any_refused
 from ..linalg.operators import SpringBlocks
-from ..numerics import cast_inexact, is_traced
+from ..numerics import cast_inexact, is_traced, stopped
 from ..state import State
 from ..status import Flag, Status
 from ..topology.base import Topology
@@ -90,16 +91,17 @@ class Heat(Rule):
         """Check what is given, and bring it to the shape of the net.
 
         Args:
-        net: the topology along which heat flows.
-        capacity: [J/K]: a number, or (N,) in the user's order; see `capacities`.
-        conductance: [W/K]: a number, (E,) in the user's order, or an edge field; see `conductances`.
-        scheme: `ExplicitHeat()` unless said.
-        boundaries: one or several; where none is named the body is insulated.
-        source: [W]: a number, (N,) in the user's order, or a function of time [s] that gives a number or a node array.
-        substeps: heat steps in one step of the nodes, of dt / substeps each.
-        every: steps of the nodes in one heat step, of every * dt. In between the temperature stands still.
-        latent: melting, with values in node shape.
-        cut_by: the system's net, where broken springs are to conduct nothing. On a lattice it must have every family of `net`.
+            net: the topology along which heat flows.
+            capacity: [J/K]: a number, or (N,) in the user's order; see `capacities`.
+            conductance: [W/K]: a number, (E,) in the user's order, or an edge field; see `conductances`.
+            scheme: `ExplicitHeat()` unless said.
+            boundaries: one or several; where none is named the body is insulated.
+            source: [W]: a number, (N,) in the user's order, or a function of time [s] that gives a number or a node array.
+            substeps: heat steps in one step of the nodes, of dt / substeps each.
+            every: steps of the nodes in one heat step, of every * dt, which falls on the multiples of that on the time axis. In between
+                the temperature stands still.
+            latent: melting; its values are numbers, or (N,) in the user's order.
+            cut_by: the system's net, where broken springs are to conduct nothing. On a lattice it must have every family of `net`.
         """
         self.net = net
         capacity = as_inexact("capacity", capacity)
@@ -108,16 +110,21 @@ class Heat(Rule):
         self.conductance = _conductance(net, conductance)
         self.scheme = _kind("scheme", ExplicitHeat() if scheme is None else scheme, HeatScheme)
         self.scheme.check(net)
-        given = (boundaries,) if isinstance(boundaries, ThermalBoundary) else tuple(boundaries)
-        self.boundaries = tuple(_kind(f"boundaries[{i}]", b, ThermalBoundary) for i, b in enumerate(given))
+        given = tuple(boundaries) if isinstance(boundaries, Iterable) else (boundaries,)
+        self.boundaries = tuple(_kind(f"boundaries[{i}]", b, ThermalBoundary).on(net, f"boundaries[{i}]") for i, b in enumerate(given))
         self.source = source if source is None or callable(source) else _source(net, source)
-        self.latent = None if latent is None else _kind("latent", latent, LatentHeat)
+        self.latent = None if latent is None else _kind("latent", latent, LatentHeat).on(net)
         for name, count in (("substeps", substeps), ("every", every)):
             if isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 1:
                 raise ValueError(f"{name} = {count!r}; expected a whole number, 1 or more.")
         self.substeps, self.every = int(substeps), int(every)
         self.cut_by = cut_by
         self.families = None if cut_by is None else _shared_families(net, cut_by)
+
+    @property
+    def sets_temperature(self) -> bool:
+        """Yes."""
+        return True
 
     def begin(self, state: State) -> State:
         """The state with given temperatures in their place and, with latent heat, an enthalpy.
@@ -144,11 +151,17 @@ class Heat(Rule):
         if self.every == 1:
             y, status = ready._advanced(flow, y, dt)
         else:
-            # The number of the step is read from the time, which is start + i dt.
-            number = jnp.round(state.time / jnp.where(dt == 0, jnp.ones_like(dt), dt))
-            is_due = (jnp.mod(number, self.every) == 0) & (dt != 0)
+            is_due = self._count(state.time, dt) > self._count(before.time, dt)
             y, status = lax.cond(is_due, lambda y: ready._advanced(flow, y, self.every * dt), lambda y: (y, Status.ok()), y)
-        return _left(flow, y, state), refused.then(status)
+        return _left(flow, y, state), refused.then(status).then(ready._too_long(before, state, dt))
+
+    def _count(self, time: Array, dt: Array) -> Array:
+        """Heat steps that were due up to a time: they fall on the multiples of every * dt.
+
+        A step of the nodes takes the difference between its two ends, so that none is lost or taken twice by rounding. The quarter keeps
+        rounding of times that are multiples of dt from moving a heat step to the next step of the nodes.
+        """
+        return jnp.floor((time / jnp.where(dt == 0, jnp.ones_like(dt), dt) + 0.25) / self.every)
 
     def _advanced(self, flow: Flow, y: Array, span: Array) -> tuple[Array, Status]:
         """Heat for a time `span` [s] that ends at the flow's."""
@@ -163,18 +176,37 @@ class Heat(Rule):
 
         return lax.scan(substep, (y, Status.ok()), jnp.arange(self.substeps, dtype=dt.dtype))[0]
 
+    def _too_long(self, before: State, state: State, dt: Array) -> Status:
+        """DT_LIMIT where a node has become so hot that `dt` is too long for it; elsewhere the limit is that at the start of the run."""
+        if all(boundary.is_linear for boundary in self.boundaries):
+            return Status.ok()
+        ready, state, dt = stopped((self, dataclasses.replace(state, temperature=before.temperature), dt))
+        rate = ready._rate(state)
+        limit = ready._limit(rate)
+        if limit is None:
+            return Status.ok()
+        # The slack of the check at the start.
+        slack = jnp.asarray(1 + 8 * float(jnp.finfo(limit.dtype).eps), limit.dtype)
+        return Status.when(Flag.DT_LIMIT, jnp.abs(dt) > limit * slack, node=jnp.argmax(jnp.ravel(rate)).astype(jnp.int32))
+
     def limit(self, state: State) -> Array | None:
         """Largest dt [s] of the nodes' steps at which an explicit scheme is stable and makes no new extreme; None for the others."""
         ready = self.prepare(state.dtype)
-        out = ready.net.incident_sum(ready.conductance).astype(state.dtype)
-        for boundary in ready.boundaries:
-            slope = boundary.slope_bound(state, _temperature(state))
-            out = out if slope is None else out + slope
-        rate = out / ready.capacity
-        held = ready.flow(state, cuts=False).held()
-        rate = rate if held is None else jnp.where(held, jnp.zeros_like(rate), rate)
+        return ready._limit(ready._rate(state))
+
+    def _limit(self, rate: Array) -> Array | None:
         limit = self.scheme.limit(jnp.max(rate))
         return None if limit is None else limit * self.substeps / self.every
+
+    def _rate(self, state: State) -> Array:
+        """Share of its heat that each free node gives away per time, at most [1/s]; of a prepared rule."""
+        out = self.net.incident_sum(self.conductance).astype(state.dtype)
+        for boundary in self.boundaries:
+            slope = boundary.slope_bound(state, _temperature(state))
+            out = out if slope is None else out + slope
+        rate = out / self.capacity
+        held = self.flow(state, cuts=False).held()
+        return rate if held is None else jnp.where(held, jnp.zeros_like(rate), rate)
 
     def power(self, state: State) -> Array:
         """Heat per time into each node [W], in node shape: conduction, sources and boundaries."""
@@ -275,6 +307,8 @@ def _source(net: Topology, value: Any) -> Array:
 
 
 def _kind(name: str, value: Any, kind: type) -> Any:
+    if isinstance(value, type) and issubclass(value, kind):
+        raise TypeError(f"{name} is the class {value.__name__} itself; expected an object of it: write {value.__name__}(...).")
     if not isinstance(value, kind):
         raise TypeError(f"{name} is a {type(value).__name__}; expected a {kind.__name__}.")
     return value

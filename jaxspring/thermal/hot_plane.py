@@ -12,12 +12,14 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._checks import as_inexact, finite, nonnegative, plane
 from ..forces.base import any_refused
 from ..state import State
+from ..topology.base import Topology
 from .boundaries import Given, ThermalBoundary, at_time
 
 
@@ -29,7 +31,7 @@ class HotPlane(ThermalBoundary):
         normal: (D,) its normal, away from the wall; of length one.
         temperature: [K], a number, or a function of time [s] that gives one.
         coefficient: h [W/(m^2 K)].
-        area: of contact of each node [m^2], a number or a node array in node shape.
+        area: of contact of each node [m^2], a number, or (N,) in the user's order; once it is in a `Heat`, a node array.
         reach: a node lower than this over the plane touches it [m].
         fade: over this height beyond the reach the contact falls to nothing [m]. With 0 it ends at once: the heat then has no
             derivative by the position.
@@ -51,13 +53,13 @@ class HotPlane(ThermalBoundary):
         """Check what is given.
 
         Args:
-        point: (D,) [m].
-        normal: (D,), of any length.
-        temperature: [K].
-        coefficient: [W/(m^2 K)].
-        area: [m^2].
-        reach: [m].
-        fade: [m].
+            point: (D,) [m].
+            normal: (D,), of any length.
+            temperature: [K].
+            coefficient: [W/(m^2 K)].
+            area: [m^2]: a number, or (N,) in the user's order.
+            reach: [m].
+            fade: [m].
         """
         self.point, self.normal = plane(point, normal)
         self.temperature = temperature if callable(temperature) else as_inexact("temperature", temperature)
@@ -70,6 +72,14 @@ class HotPlane(ThermalBoundary):
         finite("reach", self.reach)
         for name, value in (("coefficient", self.coefficient), ("area", self.area), ("fade", self.fade)):
             nonnegative(name, value, "Heat would flow from cold to hot." if name != "fade" else "A length cannot be negative.")
+
+    def on(self, net: Topology, name: str) -> HotPlane:
+        """The same with its areas in node shape.
+
+        Raises:
+            ValueError: areas of another shape than one number or one per node.
+        """
+        return eqx.tree_at(lambda plane: plane.area, self, net.node_field(self.area, f"{name}.area"))
 
     def contact(self, state: State) -> Array:
         """How well each node touches the plane: 1 within reach, 0 away from it."""
@@ -84,15 +94,15 @@ class HotPlane(ThermalBoundary):
         return jnp.where(fades, ramp, jnp.where(beyond <= 0, one, zero))
 
     def power(self, state: State, temperature: Array) -> Array:
-        """W h A (theta_plane - theta) [W]."""
+        """Heat per time w h A (theta_plane - theta) [W]."""
         return self.slope(state, temperature) * (at_time(self.temperature, state.time, temperature) - temperature)
 
     def slope(self, state: State, temperature: Array) -> Array:
-        """W h A [W/K]."""
+        """Contact times coefficient times area, w h A [W/K]."""
         return self.contact(state) * self.coefficient * self.area
 
     def slope_bound(self, state: State, temperature: Array) -> Array:
-        """H A, as if all nodes touched [W/K]."""
+        """Coefficient times area, as if all nodes touched [W/K]."""
         return jnp.broadcast_to(self.coefficient * self.area, temperature.shape)
 
     def invalid(self) -> Array:

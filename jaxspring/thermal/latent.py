@@ -20,14 +20,15 @@ from jaxtyping import Array
 
 from .._checks import as_inexact, finite, nonnegative
 from ..forces.base import any_refused
+from ..topology.base import Topology
 
 
 class LatentHeat(eqx.Module):
     """Melting at one temperature, with a latent heat. Differentiable in both.
 
     Attributes:
-        melting: melting point [K], a number or a node array in node shape (make it with `net.node_field`).
-        latent: heat that melts a node [J], a number or a node array in node shape.
+        melting: melting point [K], a number, or (N,) in the user's order; once it is in a `Heat`, a node array.
+        latent: heat that melts a node [J], likewise.
 
     Raises:
         ValueError: a negative latent heat, a value that is not finite.
@@ -41,6 +42,15 @@ class LatentHeat(eqx.Module):
         self.latent = as_inexact("latent", latent)
         finite("melting", self.melting)
         nonnegative("latent", self.latent, "Melting takes heat up.")
+
+    def on(self, net: Topology) -> LatentHeat:
+        """The same with its values in node shape.
+
+        Raises:
+            ValueError: values of another shape than one number or one per node.
+        """
+        values = (net.node_field(self.melting, "latent.melting"), net.node_field(self.latent, "latent.latent"))
+        return eqx.tree_at(lambda law: (law.melting, law.latent), self, values)
 
     def taken_up(self, temperature: Array) -> Array:
         """Latent heat of nodes at these temperatures [J]: none up to the melting point, all above it."""

@@ -93,6 +93,11 @@ class Ledger(Rule):
         """The topology of the first rule that has one."""
         return next((net for net in (getattr(r, "net", None) for r in self.rules) if net is not None), None)
 
+    @property
+    def sets_temperature(self) -> bool:
+        """Whether one of its rules does."""
+        return any(rule.sets_temperature for rule in self.rules)
+
     def with_mass(self, mass: Array) -> Ledger:
         """The same, knowing the masses [kg]."""
         rules = tuple(r.with_mass(mass) for r in self.rules)

@@ -42,19 +42,19 @@ class Equation(eqx.Module):
     trust: Array
 
     def missing(self, y: Array) -> Array:
-        """R(y) [J], zero where held."""
+        """What is missing, r(y) [J], zero where held."""
         flow = self.flow
         r = flow.capacity * (self.start - y) + self.dt * flow.power(flow.temperature(y))
         held = flow.held()
         return r if held is None else jnp.where(held, jnp.zeros_like(r), r)
 
     def matrix(self, y: Array) -> SpringMatrix:
-        """C + dt (S + K), identity where held or melting."""
+        """The matrix C + dt (S + K), identity where held or melting."""
         return self.flow.matrix(y, self.dt)
 
 
 def relaxed(equation: Equation, y: Array) -> Array:
-    """Y after every node has taken up what it misses, as if its neighbours stood still."""
+    """The unknown y after every node has taken up what it misses, as if its neighbours stood still."""
     flow, latent = equation.flow, _latent(equation)
     missing = equation.missing(y)
     theta, h = flow.temperature(y), latent.enthalpy(y, flow.capacity)
@@ -67,7 +67,7 @@ def relaxed(equation: Equation, y: Array) -> Array:
 
 
 def searched(equation: Equation, matrix: SpringMatrix, y: Array, missing: Array, dtheta: Array) -> Array:
-    """Y after a change of temperature, shortened to where F falls most; nodes that melt take up what then reaches them.
+    """The unknown after a change of temperature, shortened to where F falls most; nodes that melt take up what then reaches them.
 
     Tried are the step, its halves and quarters, and the step in which every node stops where it would cross the melting point.
     """

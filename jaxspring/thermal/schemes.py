@@ -29,7 +29,7 @@ class HeatScheme(eqx.Module):
 
     @abc.abstractmethod
     def advance(self, flow: Flow, y: Array, dt: Array) -> tuple[Array, Status]:
-        """`y` a time dt [s] after that of `flow`, and how the solves ended."""
+        """The unknown y a time dt [s] after that of `flow`, and how the solves ended."""
 
     def limit(self, rate: Array) -> Array | None:
         """Largest dt [s], where no node gives away its heat faster than `rate` [1/s]; None where nothing limits it."""
@@ -43,11 +43,11 @@ class ExplicitHeat(HeatScheme):
     """Forward in time: order 1. Above its limit, which is reported as DT_LIMIT, it blows up."""
 
     def advance(self, flow: Flow, y: Array, dt: Array) -> tuple[Array, Status]:
-        """Y + dt P / C."""
+        """Forward in time: y + dt P / C."""
         return flow.at(flow.state.time + dt).hold(pushed(flow, y, dt)), Status.ok()
 
     def limit(self, rate: Array) -> Array:
-        """1 / rate: a node then keeps a share of its own temperature, and no new extreme arises."""
+        """One over the rate: a node then keeps a share of its own temperature, and no new extreme arises."""
         return 1 / rate
 
 
@@ -90,7 +90,7 @@ class CrankNicolsonHeat(_Solved):
 
 
 def pushed(flow: Flow, y: Array, dt: Array) -> Array:
-    """`y` after an explicit step of dt [s]."""
+    """The unknown y after an explicit step of dt [s]."""
     return y + dt * flow.power(flow.temperature(y)) / flow.capacity
 
 

@@ -74,7 +74,7 @@ class ThermalStiffness(StiffnessRule):
         return False
 
     def stiffness(self, net: Topology, state: State) -> EdgeField:
-        """k_ij at the present temperatures [N/m]."""
+        """Stiffness k_ij at the present temperatures [N/m]."""
         warm = net.average(temperature_of(state, "ThermalStiffness"))
         full, low, high = cast_inexact((net.edge_field(self.full, "stiffness"), self.softening, self.melting), state.dtype)
         b = None if self.sharpness is None else self.sharpness.astype(state.dtype)
@@ -113,7 +113,7 @@ class ThermalExpansion(ExpansionRule):
         self.coefficient, self.reference = _number("coefficient", coefficient), _number("reference", reference)
 
     def factor(self, net: Topology, state: State) -> EdgeField:
-        """1 + a (theta_ij - theta_0)."""
+        """Growth 1 + a (theta_ij - theta_0)."""
         a, at = self.coefficient.astype(state.dtype), self.reference.astype(state.dtype)
         warm = net.average(temperature_of(state, "ThermalExpansion"))
         return warm.map(lambda theta: jnp.maximum(1 + a * (theta - at), jnp.zeros((), theta.dtype)))

@@ -110,3 +110,16 @@ def test_f9_two_time_steps(latent, rng):
     for run in (one_by_one, within, seldom):
         assert int(run.status.flags) == 0
         assert drift(single, start, run.state) <= 1e-13
+
+
+@pytest.mark.parametrize("wrap", [lambda rule: rule, js.Ledger], ids=["Heat", "Ledger"])
+def test_heat_that_blows_up_is_named(wrap):
+    """A source that is infinite from 0.35 s on: NONFINITE at step 5, at its node, in the name of the rule and not of the springs."""
+    net = js.lattice(4)
+    heat = js.Heat(net, 1.0, 0.0, source=lambda t: jnp.where(jnp.arange(4) == 2, jnp.where(t > 0.35, jnp.inf, 1.0), 0.0))
+    system = js.System(net, 1.0, js.Springs(net, 1.0, 1.0), rules=wrap(heat))
+    run = js.rollout(system, js.State.from_points(net, net.grid(), temperature=300.0), js.SymplecticEuler(), 0.1, 20)
+    assert bool(run.status.has(Flag.NONFINITE))
+    assert (int(run.status.step), int(run.status.node), int(run.status.effect)) == (5, 2, 1)
+    with pytest.raises(js.SimulationError, match=f"position, velocity or temperature is NaN.*effect {type(wrap(heat)).__name__}"):
+        js.raise_for_status(run)

@@ -157,6 +157,43 @@ def test_limit_of_an_explicit_step():
     assert float(seldom.limit(state)) == pytest.approx(3 / rate[1:].max(), rel=1e-12)
 
 
+def test_nothing_limits_implicit_heat_of_nodes_that_stand_still():
+    """`stable_dt` with `Still` is infinite where heat is implicit, or there is none, and that of heat where it is explicit."""
+    net = js.lattice(3)
+    state = js.State.from_points(net, net.grid(), temperature=300.0)
+    for rules, expected in ((js.Heat(net, 1.0, 2.0, js.BackwardEulerHeat()), np.inf), ((), np.inf), (js.Heat(net, 1.0, 2.0), 0.25)):
+        assert float(js.stable_dt(js.System(net, 1.0, rules=rules), state, js.Still())) == expected
+
+
+@pytest.mark.slow
+def test_radiation_that_gets_too_hot_for_dt_is_reported():
+    """A step that is short enough at 300 K and too long at 400 K gives DT_LIMIT with step and node, in the rule's name; a short one does
+    not, nor an implicit one, nor a node that is held.
+    """
+    net, hottest = js.lattice(20), np.arange(20) == 7
+    points, source = net.grid(), np.where(hottest, 1000.0, 900.0)
+    start = js.State.from_points(net, points, temperature=300.0)
+
+    def go(scheme, dt, n_steps, *more):
+        boundaries = (js.Radiation(net, np.ones(20, bool), 1.0, 300.0, 1.0), *more)
+        heat = js.Heat(net, 1.0, 0.0, scheme, source=source, boundaries=boundaries)
+        return js.rollout(js.System(net, 1.0, rules=heat), start, js.Still(), dt, n_steps)
+
+    with pytest.warns(
+        js.StabilityWarning, match="dt = 0.14 s was below stable_dt at the start, but later the limit fell below it.*a node became too hot"
+    ):
+        long = go(js.ExplicitHeat(), 0.14, 40)
+    assert bool(long.status.has(js.Flag.DT_LIMIT))
+    assert (int(long.status.step), int(long.status.node), int(long.status.effect)) == (2, 7, 0)
+    short = go(js.ExplicitHeat(), 0.03, 1000)
+    assert int(short.status.flags) == 0
+    settled = (source / 5.670374419e-8 + 300.0**4) ** 0.25
+    np.testing.assert_allclose(short.state.temperature, settled, rtol=1e-9)
+    assert int(go(js.BackwardEulerHeat(), 0.14, 40).status.flags) == 0
+    held = go(js.ExplicitHeat(), 0.14, 40, js.FixedTemperature(net, np.ones(20, bool), lambda t: 300.0 + t))
+    assert int(held.status.flags) == 0
+
+
 def test_radiation_pulls_back_below_zero():
     """Below 0 K, where a step too long may lead, the loss is odd: -50 K lacks what 50 K radiates, and the slope is its derivative."""
     net, factor = js.lattice(2), 0.8 * 5.670374419e-8 * 0.5
@@ -174,6 +211,38 @@ def test_heat_steps_within_a_step_see_their_own_time():
         heat = js.Heat(net, 1.0, 0.0, source=lambda t: t * t, **options)
         end = run(heat, 300.0, dt, n_steps, points=np.zeros((1, 1)))
         assert float(end.temperature[0]) == pytest.approx(300 + np.sum((0.05 * np.arange(20)) ** 2) * 0.05, rel=1e-14)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("every", "dtype"), [(2, "float32"), (4, "float64")])
+@pytest.mark.parametrize("start", [0.0, 0.05, 0.075, 0.25, 0.3, 1234.567])
+def test_heat_that_comes_seldom_comes_as_often_from_any_start(start, every, dtype):
+    """1 W for 4.8 s warms by 4.8 K in one run, in pieces of 7 steps and in resumed ones, to one heat step; dt = 0 does not warm at all."""
+    net, n_steps = js.lattice(3), 48
+    system = js.System(net, 1.0, rules=js.Heat(net, 1.0, 0.01, source=1.0, every=every))
+    first = js.State.from_points(net, net.grid().astype(dtype), temperature=np.full(3, 300.0, dtype), time=start)
+    assert first.dtype == dtype
+    unbroken = js.rollout(system, first, js.Still(), 0.1, n_steps)
+    pieces, resumed, resume = first, first, None
+    for n in (7, 7, 7, 7, 7, 7, 6):
+        pieces = js.rollout(system, pieces, js.Still(), 0.1, n).state
+        run = js.rollout(system, resumed, js.Still(), 0.1, n, resume=resume)
+        resumed, resume = run.state, run.resume
+    for end in (unbroken.state, pieces):
+        assert abs(float(end.temperature.mean()) - 304.8) <= 0.1 * every + 1e-3
+    np.testing.assert_array_equal(resumed.temperature, unbroken.state.temperature)
+    np.testing.assert_array_equal(js.rollout(system, first, js.Still(), 0.0, 8).state.temperature, first.temperature)
+
+
+@pytest.mark.slow
+def test_heat_that_comes_seldom_follows_a_change_of_dt():
+    """Runs of 0.1 s, 0.2 s and 0.04 s a step, one after the other, warm by 1 K/s, each to one heat step of its own."""
+    net = js.lattice(3)
+    system = js.System(net, 1.0, rules=js.Heat(net, 1.0, 0.01, source=1.0, every=2))
+    state = js.State.from_points(net, net.grid(), temperature=300.0)
+    for dt, n_steps in ((0.1, 11), (0.2, 30), (0.04, 50)):
+        before, state = state, js.rollout(system, state, js.Still(), dt, n_steps).state
+        assert abs(float(state.temperature[0] - before.temperature[0]) - dt * n_steps) <= 2 * dt + 1e-9
 
 
 def test_what_starts_at_the_melting_point_is_solid():
@@ -213,6 +282,17 @@ def test_refusals():
         (ValueError, r"conductance\[0\] = -1.0", lambda: js.Heat(net, 1.0, [-1.0, 1.0])),
         (ValueError, "substeps = 0", lambda: js.Heat(net, 1.0, 1.0, substeps=0)),
         (TypeError, "scheme is a str", lambda: js.Heat(net, 1.0, 1.0, "explicit")),
+        (TypeError, r"boundaries\[0\] is a float; expected a ThermalBoundary", lambda: js.Heat(net, 1.0, 1.0, boundaries=300.0)),
+        (TypeError, r"write BackwardEulerHeat\(", lambda: js.Heat(net, 1.0, 1.0, js.BackwardEulerHeat)),
+        (TypeError, r"forces\[0\] is a Heat, .* in rules=", lambda: js.System(net, 1.0, js.Heat(net, 1.0, 1.0))),
+        (TypeError, r"forces\[0\] is a float", lambda: js.System(net, 1.0, 9.81)),
+        (TypeError, r"rules\[0\] is a float", lambda: js.System(net, 1.0, rules=9.81)),
+        (ValueError, "section = -1.0", lambda: js.capacities(net, 1.0, 1.0, 1.0, section=-1.0)),
+        (ValueError, "section = nan", lambda: js.conductances(net, 1.0, 1.0, section=np.nan)),
+        (ValueError, r"section has shape \(3,\)", lambda: js.capacities(net, 1.0, 1.0, 1.0, section=np.ones(3))),
+        (ValueError, r"section has shape \(2,\)", lambda: js.conductances(net, 1.0, 1.0, section=np.ones(2))),
+        (ValueError, "emissivity = 1.5", lambda: js.Radiation(net, np.ones(3, bool), [0.5, 1.5, 1.0], 300.0, 1.0)),
+        (ValueError, "not symmetric", lambda: js.conductances(sheet, np.array([[1e-9, 5e-10], [1e-10, 1e-9]]), 1.0)),
         (TypeError, r"boundaries\[0\] is a int", lambda: js.Heat(net, 1.0, 1.0, boundaries=(3,))),
         (ValueError, "axes, but springs", lambda: js.Heat(sheet, 1.0, 1.0, js.SplitHeat())),
         (ValueError, "this net is a Graph", lambda: js.Heat(js.Graph.from_edges([(0, 1)], 2), 1.0, 1.0, js.SplitHeat())),
@@ -234,6 +314,38 @@ def test_refusals():
     wet = dataclasses.replace(cold, temperature=jnp.ones(3), enthalpy=jnp.ones(3))
     with pytest.raises(ValueError, match="knows no melting"):
         js.System(net, 1.0, rules=js.Heat(net, 1.0, 1.0)).begin(wet)
+
+
+def test_fields_of_another_shape_are_refused():
+    """Areas, melting points and masks that are not those of the net would broadcast along an axis of a lattice: each is an error."""
+    net, chain = js.lattice((4, 4)), js.lattice(4)
+
+    def plane(area):
+        return js.HotPlane((0.0, 0.0), (0.0, 1.0), 400.0, 5.0, area, reach=1.0)
+
+    for match, more in [
+        (r"boundaries\[0\]\.area has shape \(4,\); expected .*\(16,\)", {"boundaries": plane(np.arange(4.0))}),
+        (r"latent\.melting has shape \(4,\)", {"latent": js.LatentHeat([290.0, 310.0, 350.0, 400.0], 1.0)}),
+        (r"latent\.latent has shape \(4,\)", {"latent": js.LatentHeat(290.0, np.ones(4))}),
+        (
+            r"boundaries\[1\] \(FixedTemperature\) names nodes on a net of shape \(4,\); expected \(4, 4\)",
+            {"boundaries": (plane(1.0), js.FixedTemperature(chain, np.arange(4) < 1, 400.0))},
+        ),
+        (r"\(HeatFlux\) names nodes", {"boundaries": js.HeatFlux(chain, np.arange(4) < 1, 1.0, 1.0)}),
+    ]:
+        with pytest.raises(ValueError, match=match):
+            js.Heat(net, 1.0, 1.0, **more)
+
+
+@pytest.mark.parametrize("net", [js.lattice((2, 2)), js.Graph.from_edges([(3, 0), (0, 2), (2, 1)], 4)], ids=["lattice", "graph"])
+def test_areas_and_melting_points_are_in_the_users_order(net):
+    """A plane with one area per node, and a melting point per node, act on the nodes that the user numbered."""
+    area, melting = np.array([1.0, 2.0, 3.0, 4.0]), np.array([290.0, 310.0, 350.0, 400.0])
+    plane = js.HotPlane((0.0, 0.0), (0.0, 1.0), 400.0, 5.0, area, reach=9.0)
+    heat = js.Heat(net, 1.0, 0.0, boundaries=plane, latent=js.LatentHeat(melting, area))
+    state = js.State.from_points(net, np.zeros((4, 2)), temperature=320.0)
+    np.testing.assert_allclose(net.flatten_nodes(heat.power(state)), 5.0 * area * 80.0, rtol=1e-14)
+    np.testing.assert_array_equal(net.flatten_nodes(heat.begin(state).enthalpy), [1.0, 2.0, 0.0, 0.0])
 
 
 def test_a_bad_constant_that_slipped_in_is_reported():

@@ -179,9 +179,7 @@ def test_radiation_that_gets_too_hot_for_dt_is_reported():
         heat = js.Heat(net, 1.0, 0.0, scheme, source=source, boundaries=boundaries)
         return js.rollout(js.System(net, 1.0, rules=heat), start, js.Still(), dt, n_steps)
 
-    with pytest.warns(
-        js.StabilityWarning, match="dt = 0.14 s was below stable_dt at the start, but later the limit fell below it.*a node became too hot"
-    ):
+    with pytest.warns(js.StabilityWarning, match="dt = 0.14 s was below stable_dt at the start, but later.*a node became too hot"):
         long = go(js.ExplicitHeat(), 0.14, 40)
     assert bool(long.status.has(js.Flag.DT_LIMIT))
     assert (int(long.status.step), int(long.status.node), int(long.status.effect)) == (2, 7, 0)

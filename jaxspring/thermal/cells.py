@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._checks import as_inexact, has_shape, positive
+from .._checks import as_inexact, constant, has_shape, positive
 from ..topology.base import Topology
 from ..topology.lattice import Lattice
 
@@ -127,10 +127,7 @@ def spacings(net: Lattice, spacing: Any) -> tuple[Array, ...]:
 
 def section_of(section: Any) -> Array:
     """What the lattice's dimensions lack of a volume, which must be one positive number."""
-    section = as_inexact("section", section)
-    has_shape("section", section, {"one number": ()})
-    positive("section", section, "A cell would have no volume.")
-    return section
+    return constant("section", section, "A cell would have no volume.")
 
 
 __all__ = ["Cells", "EqualCells", "HalfCells", "capacities", "on_lattice", "section_of", "spacings"]

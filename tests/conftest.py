@@ -31,6 +31,17 @@ hypothesis.settings.load_profile("repeatable")
 SEED = 20260101
 
 
+def pytest_addoption(parser):
+    """`--reversed` runs the last test first."""
+    parser.addoption("--reversed", action="store_true", help="run the last test first: what leans on an earlier test's leftovers fails")
+
+
+def pytest_collection_modifyitems(config, items):
+    """The other order, where it was asked for."""
+    if config.getoption("--reversed"):
+        items.reverse()
+
+
 @pytest.fixture(autouse=True, scope="module")
 def forget_programs():
     """Drop a file's compiled programs after it: each holds pieces of address space, of which Linux gives a process 65,530."""

@@ -100,15 +100,15 @@ def _transpose(cotangents, *args, forward, transpose, n_residuals):
 
 
 def _batch(args, dims, *, forward, transpose, n_residuals):
-    (size,) = {a.shape[d] for a, d in zip(args, dims, strict=True) if d is not batching.not_mapped}
+    (size,) = {a.shape[d] for a, d in zip(args, dims, strict=True) if d is not None}
     moved = []
     for i, (a, d) in enumerate(zip(args, dims, strict=True)):
-        if d is not batching.not_mapped:
+        if d is not None:
             a = jnp.moveaxis(a, d, 0)
         elif i >= n_residuals:  # every operand gets the batch axis, so that the transpose returns one cotangent per lane
             a = jnp.broadcast_to(a, (size, *jnp.shape(a)))
         moved.append(a)
-    residual_axes = [None if d is batching.not_mapped else 0 for d in dims[:n_residuals]]
+    residual_axes = [None if d is None else 0 for d in dims[:n_residuals]]
     out = _linear_call.bind(
         *moved,
         forward=partial(_over_lanes, forward, tuple(residual_axes)),
@@ -142,7 +142,7 @@ def any_lane(flag: Array) -> Array:
 
 
 def _reduce_lanes(args: tuple[Array], dims: tuple[int]) -> tuple[Array, Any]:
-    return any_lane(jnp.any(args[0], axis=dims[0])), batching.not_mapped
+    return any_lane(jnp.any(args[0], axis=dims[0])), None
 
 
 _any_lane = Primitive("jaxspring_any_lane")

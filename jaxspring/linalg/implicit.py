@@ -87,10 +87,10 @@ def _jvp(primals: Any, tangents: Any, *, tangent: Any, n: int) -> tuple[Any, Any
 
 
 def _batch(args: Any, dims: Any, *, tangent: Any, n: int) -> tuple[Any, Any]:
-    (size,) = {a.shape[d] for a, d in zip(args, dims, strict=True) if d is not batching.not_mapped}
-    moved = [a if d is batching.not_mapped else jnp.moveaxis(a, d, 0) for a, d in zip(args, dims, strict=True)]
-    y = [jnp.broadcast_to(a, (size, *a.shape)) if d is batching.not_mapped else a for a, d in zip(moved[:n], dims[:n], strict=True)]
-    axes = [None if d is batching.not_mapped else 0 for d in dims[n:]]
+    (size,) = {a.shape[d] for a, d in zip(args, dims, strict=True) if d is not None}
+    moved = [a if d is None else jnp.moveaxis(a, d, 0) for a, d in zip(args, dims, strict=True)]
+    y = [jnp.broadcast_to(a, (size, *a.shape)) if d is None else a for a, d in zip(moved[:n], dims[:n], strict=True)]
+    axes = [None if d is None else 0 for d in dims[n:]]
 
     def over_lanes(which: tuple[int, ...], given: Sequence[Array], y: Sequence[Array], moved: Sequence[Array]) -> list[Array]:
         lane = partial(tangent, which)

@@ -99,8 +99,7 @@ class IterativeSolver(LinearSolver):
         """
         start = None if x0 is None else lax.stop_gradient(x0)
         precondition = identity if preconditioner is None else preconditioner
-        default = 1e-8 if norm(b).dtype == jnp.float64 else 1e-5
-        tolerance = self.tolerance or default
+        tolerance = self._goal(b)
 
         def forward(operator: Operator, rhs: PyTree) -> tuple[PyTree, SolveInfo]:
             return self._guarded(operator, rhs, start, precondition, tolerance)
@@ -119,6 +118,18 @@ class IterativeSolver(LinearSolver):
         precondition = self.preconditioner.build(stopped(matrix))
         x, info = self.solve(matrix, matrix.pick(b, zero), precondition, start)
         return matrix.pick(x, b), info, memory
+
+    def find_in_step(self, matrix: SpringMatrix, b: Vector, guess: Vector | None, memory: Any) -> tuple[Vector, SolveInfo, Any]:
+        """As `solve_in_step`, without a derivative."""
+        matrix, b, guess = stopped((matrix, b, guess))
+        zero = Vector.zeros_like(b)
+        start = None if guess is None else matrix.pick(guess, zero)
+        x, info = self._guarded(matrix, matrix.pick(b, zero), start, self.preconditioner.build(matrix), self._goal(b))
+        return matrix.pick(x, b), info, memory
+
+    def _goal(self, b: PyTree) -> float:
+        """Wanted residual of a solution of unit right-hand side."""
+        return self.tolerance or (1e-8 if norm(b).dtype == jnp.float64 else 1e-5)
 
     def _guarded(
         self, matvec: Operator, b: PyTree, guess: PyTree | None, precondition: Operator, tolerance: float

@@ -144,7 +144,7 @@ class _Solve(ImplicitProblem):
         right_side = still.impulse()
         if still.system.motion is not None:
             right_side = right_side - matrix.blocks.product(matrix.pick(Vector.zeros_like(known), known))
-        dv, info, memory = self.solver.solve_in_step(matrix, matrix.pick(right_side, known), None, memory)
+        dv, info, memory = self.solver.find_in_step(matrix, matrix.pick(right_side, known), None, memory)
         return implicitly(self, kick, dv), info, memory
 
 

@@ -121,7 +121,7 @@ class LinearStage(ImplicitProblem):
         if still.system.motion is not None:
             right_side = right_side - matrix.blocks.product(still.known)
         zero = Vector.zeros_like(right_side)
-        y, info, memory = self.solver.solve_in_step(matrix, still.on_free(right_side, zero), still.predictor.velocity, memory)
+        y, info, memory = self.solver.find_in_step(matrix, still.on_free(right_side, zero), still.predictor.velocity, memory)
         return implicitly(self, stage, y), info, memory
 
     def _right_side(self, stage: Stage) -> Vector:

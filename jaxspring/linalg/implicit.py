@@ -9,7 +9,7 @@ reverse mode, and derivatives of derivatives are right too.
 from __future__ import annotations
 
 import abc
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -66,6 +66,25 @@ def implicitly(problem: ImplicitProblem, theta: PyTree, solution: PyTree) -> PyT
     return jax.tree.unflatten(y_tree, out)
 
 
+def grown(rate: Callable[[PyTree], PyTree], theta: PyTree, time: Array, like: PyTree) -> PyTree:
+    """Zeros like `like`, whose derivative by `time` is rate(theta): what grows at that rate, when no time has passed.
+
+    The rate is computed where a derivative by `time` is taken, and nowhere else; derivatives of that derivative see theta.
+    """
+    zeros, tree = jax.tree.flatten(jax.tree.map(jnp.zeros_like, like))
+    arrays, static = eqx.partition(theta, eqx.is_array)
+    theta_leaves, theta_tree = jax.tree.flatten(arrays)
+
+    def tangent(which: tuple[int, ...], given: Sequence[Array], y: Sequence[Array], moved: Sequence[Array]) -> list[Array]:
+        if 0 not in which:
+            return [jnp.zeros_like(a) for a in y]
+        rates = jax.tree.leaves(rate(eqx.combine(jax.tree.unflatten(theta_tree, list(given[1:])), static)))
+        return [moved[0] * a for a in rates]
+
+    out = _implicit.bind(*zeros, time, *theta_leaves, tangent=tangent, n=len(zeros))
+    return jax.tree.unflatten(tree, out)
+
+
 def _values(*args: Array, tangent: Any, n: int) -> list[Array]:
     return list(args[:n])
 
@@ -94,4 +113,4 @@ def _batch(args: Any, dims: Any, *, tangent: Any, n: int) -> tuple[Any, Any]:
 _implicit = new_primitive("jaxspring_implicit", _values, _values, _batch, _jvp)
 
 
-__all__ = ["SOLUTION", "ImplicitProblem", "implicitly"]
+__all__ = ["SOLUTION", "ImplicitProblem", "grown", "implicitly"]

@@ -239,7 +239,7 @@ def _guarded(factor: SkylineFactor, operator: Callable[[Vector], Vector], b: Vec
     """Solve, correct by the residual where that pays, and look at what is left."""
     size = norm(b)
     is_zero = size == 0
-    scale = jnp.where(is_zero, jnp.ones_like(size), size)
+    scale = jnp.maximum(size, jnp.finfo(size.dtype).tiny)
     unit = b / scale
     x = factor.solve(unit)
     left = unit - operator(x)

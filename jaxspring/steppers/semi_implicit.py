@@ -67,7 +67,7 @@ class SemiImplicit(Stepper):
             return _moved(state, dt, system.hold(dv)), None
         dv, info, carried = _Solve(self.solver).solve(kick, memory.solver)
         new = _moved(state, dt, dv)
-        given = Stage(system, state.position, state.velocity, dt, state.time, state, kick.known(), True)
+        given = Stage(system, state.position, state.velocity, dt, state.time, state, kick.known(), None, True)
         status = _breakdown(given, new).then(info.status)
         return new, Memory(carried, SolveInfo(info.residual, info.iterations, status), None, None)
 

@@ -38,7 +38,6 @@ from .base import Stepper
 from .newton import Newton, NewtonStage
 from .stage import LinearStage, Stage, known_velocities
 
-
 # Stands for a dt of zero [s].
 _SHORT = 1e-10
 

@@ -2,11 +2,14 @@
 
 `linear_call` exists because JAX's `linear_call` cannot be batched and `custom_vjp` cannot be differentiated forward. A map given as
 a pair (forward, transpose), each linear in its operand, works here under `jit`, `vmap`, `jvp`, `grad`, `jacfwd` and `hessian`.
+
+This is the one module that reads `jax.extend` and `jax.interpreters`, which promise nothing from one version of JAX to the next:
+other modules make their primitives with `new_primitive`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -74,10 +77,10 @@ def _jvp(primals, tangents, *, forward, transpose, n_residuals):
     params = {"forward": forward, "transpose": transpose, "n_residuals": n_residuals}
     out = _linear_call.bind(*primals, **params)
     total: list[Any] = [jnp.zeros_like(o) for o in out]
-    if any(type(t) is not ad.Zero for t in tangents[n_residuals:]):
+    if not all(is_zero_tangent(t) for t in tangents[n_residuals:]):
         moved = [ad.instantiate_zeros(t) for t in tangents[n_residuals:]]
         total = _linear_call.bind(*residuals, *moved, **params)
-    varying = [i for i in range(n_residuals) if type(tangents[i]) is not ad.Zero]
+    varying = [i for i in range(n_residuals) if not is_zero_tangent(tangents[i])]
     if varying:
 
         def of_residuals(*some):
@@ -100,19 +103,11 @@ def _transpose(cotangents, *args, forward, transpose, n_residuals):
 
 
 def _batch(args, dims, *, forward, transpose, n_residuals):
-    (size,) = {a.shape[d] for a, d in zip(args, dims, strict=True) if d is not None}
-    moved = []
-    for i, (a, d) in enumerate(zip(args, dims, strict=True)):
-        if d is not None:
-            a = jnp.moveaxis(a, d, 0)
-        elif i >= n_residuals:  # every operand gets the batch axis, so that the transpose returns one cotangent per lane
-            a = jnp.broadcast_to(a, (size, *jnp.shape(a)))
-        moved.append(a)
-    residual_axes = [None if d is None else 0 for d in dims[:n_residuals]]
+    args, residual_axes = lanes_first(args, dims, n_residuals)
     out = _linear_call.bind(
-        *moved,
-        forward=partial(_over_lanes, forward, tuple(residual_axes)),
-        transpose=partial(_over_lanes, transpose, tuple(residual_axes)),
+        *args,
+        forward=partial(_over_lanes, forward, residual_axes),
+        transpose=partial(_over_lanes, transpose, residual_axes),
         n_residuals=n_residuals,
     )
     return out, [0] * len(out)
@@ -123,14 +118,47 @@ def _over_lanes(function, residual_axes, *leaves):
     return jax.vmap(function, in_axes=in_axes)(*leaves)
 
 
-_linear_call = Primitive("jaxspring_linear_call")
-_linear_call.multiple_results = True
-_linear_call.def_impl(_evaluate)
-_linear_call.def_abstract_eval(_abstract)
-ad.primitive_jvps[_linear_call] = _jvp
-ad.primitive_transposes[_linear_call] = _transpose
-batching.primitive_batchers[_linear_call] = _batch
-mlir.register_lowering(_linear_call, mlir.lower_fun(_evaluate, multiple_results=True))
+def lanes_first(args: Sequence[Array], dims: Sequence[int | None], n_shared: int) -> tuple[list[Array], tuple[int | None, ...]]:
+    """What a primitive's rule for `vmap` is given, with the batch axis in front: the arguments, and the axes of the first `n_shared`.
+
+    Those may be shared by all lanes (axis None); every later argument gets a batch axis, so that each lane has its own.
+    """
+    (size,) = {a.shape[d] for a, d in zip(args, dims, strict=True) if d is not None}
+    moved = [a if d is None else jnp.moveaxis(a, d, 0) for a, d in zip(args, dims, strict=True)]
+    own = [jnp.broadcast_to(a, (size, *jnp.shape(a))) if d is None else a for a, d in zip(moved, dims, strict=True)]
+    return moved[:n_shared] + own[n_shared:], tuple(None if d is None else 0 for d in dims[:n_shared])
+
+
+def new_primitive(name: str, evaluate: Any, abstract: Any, batch: Any, jvp: Any = None, transpose: Any = None) -> Primitive:
+    """A primitive with several results.
+
+    Args:
+        name: in programs.
+        evaluate: (*args, **params) -> results, in terms of JAX: what the primitive computes.
+        abstract: the same for shapes.
+        batch: (args, dims, **params) -> results, dims; a dim is None where an argument has no batch axis.
+        jvp: (primals, tangents, **params) -> results, their tangents; None where it has no derivative.
+        transpose: (cotangents, *args, **params) -> cotangents.
+    """
+    primitive = Primitive(name)
+    primitive.multiple_results = True
+    primitive.def_impl(evaluate)
+    primitive.def_abstract_eval(abstract)
+    batching.primitive_batchers[primitive] = batch
+    mlir.register_lowering(primitive, mlir.lower_fun(evaluate, multiple_results=True))
+    if jvp is not None:
+        ad.primitive_jvps[primitive] = jvp
+    if transpose is not None:
+        ad.primitive_transposes[primitive] = transpose
+    return primitive
+
+
+def is_zero_tangent(tangent: Any) -> bool:
+    """Whether a rule was given no tangent for an argument."""
+    return type(tangent) is ad.Zero
+
+
+_linear_call = new_primitive("jaxspring_linear_call", _evaluate, _abstract, _batch, _jvp, _transpose)
 
 
 def any_lane(flag: Array) -> Array:
@@ -138,18 +166,14 @@ def any_lane(flag: Array) -> Array:
 
     A `lax.cond` on it stays a conditional under `vmap`, where one on a value per lane would run both branches.
     """
-    return _any_lane.bind(flag)
+    return _any_lane.bind(flag)[0]
 
 
-def _reduce_lanes(args: tuple[Array], dims: tuple[int]) -> tuple[Array, Any]:
-    return any_lane(jnp.any(args[0], axis=dims[0])), None
+def _reduce_lanes(args: tuple[Array], dims: tuple[int]) -> tuple[list[Array], list[None]]:
+    return [any_lane(jnp.any(args[0], axis=dims[0]))], [None]
 
 
-_any_lane = Primitive("jaxspring_any_lane")
-_any_lane.def_impl(lambda flag: flag)
-_any_lane.def_abstract_eval(lambda flag: ShapedArray(flag.shape, flag.dtype))
-batching.primitive_batchers[_any_lane] = _reduce_lanes
-mlir.register_lowering(_any_lane, mlir.lower_fun(lambda flag: flag, multiple_results=False))
+_any_lane = new_primitive("jaxspring_any_lane", lambda flag: [flag], lambda flag: [ShapedArray(flag.shape, flag.dtype)], _reduce_lanes)
 
 
 def cast_inexact(tree: PyTree, dtype: Any) -> PyTree:
@@ -177,4 +201,16 @@ def is_traced(*trees: PyTree) -> bool:
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
 
 
-__all__ = ["Array", "any_lane", "cast_inexact", "is_traced", "linear_call", "stopped", "tied", "tiny"]
+__all__ = [
+    "Array",
+    "any_lane",
+    "cast_inexact",
+    "is_traced",
+    "is_zero_tangent",
+    "lanes_first",
+    "linear_call",
+    "new_primitive",
+    "stopped",
+    "tied",
+    "tiny",
+]

@@ -227,6 +227,12 @@ class System(eqx.Module):
 
         return eqx.tree_at(lambda s: (s.position, s.velocity), state, (pick(position, state.position), pick(velocity, state.velocity)))
 
+    def stage(self, state: State) -> State:
+        """A state within a step with moved nodes where their schedule has them at its time: at their place of the step's start, a
+        stepper would lose its order.
+        """
+        return state if self.motion is None else self.constrain(state)
+
     def energy(self, state: State) -> Energy:
         """Kinetic energy and each force's potential [J]."""
         kinetic = 0.5 * jnp.sum(self.mass.astype(state.dtype) * state.velocity.dot(state.velocity))

@@ -8,6 +8,7 @@ from typing import Any
 import equinox as eqx
 from jaxtyping import Array
 
+from ..numerics import stopped
 from ..status import Status
 from ..vector import Vector
 from .operators import SpringMatrix
@@ -40,6 +41,14 @@ class LinearSolver(eqx.Module):
     @abc.abstractmethod
     def solve_in_step(self, matrix: SpringMatrix, b: Vector, guess: Vector | None, memory: Any) -> tuple[Vector, SolveInfo, Any]:
         """Solve `matrix` x = b, differentiably in b and in the matrix; `guess` is where an iteration starts."""
+
+    def find_in_step(self, matrix: SpringMatrix, b: Vector, guess: Vector | None, memory: Any) -> tuple[Vector, SolveInfo, Any]:
+        """The same without a derivative: for steps, whose derivative is that of their equations.
+
+        A solver that is written with `lax.custom_linear_solve` spares its rules here, which compile long; and what that tells besides
+        its solution gets a batch axis wherever a tangent has one, as under `jacfwd`.
+        """
+        return stopped(self.solve_in_step(*stopped((matrix, b, guess, memory))))
 
 
 __all__ = ["LinearSolver", "SolveInfo"]

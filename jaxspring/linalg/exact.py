@@ -22,6 +22,7 @@ from ..numerics import stopped
 from ..vector import Vector
 from .cg import CG
 from .implicit import ImplicitProblem
+from .iterative import norm
 from .operators import SpringMatrix
 
 Operator = Callable[[Vector], Vector]
@@ -70,10 +71,10 @@ class ExactSolver(eqx.Module):
         return lax.custom_linear_solve(jacobian, b, solve, transpose_solve=solve)
 
     def _stabilised(self, operator: Operator, b: Vector, precondition: Operator) -> Vector:
-        norm = jnp.sqrt(jnp.sum(b.dot(b)))
-        scale = jnp.where(norm > 0, norm, jnp.ones_like(norm))
+        size = norm(b)
+        scale = jnp.maximum(size, jnp.finfo(size.dtype).tiny)
         unit = b / scale
-        tolerance = self.cg.tolerance or (1e-8 if norm.dtype == jnp.float64 else 1e-5)
+        tolerance = self.cg.tolerance or (1e-8 if size.dtype == jnp.float64 else 1e-5)
         x, _ = bicgstab(operator, unit, tol=tolerance, maxiter=self.cg.max_iter, M=precondition)
         left = unit - operator(x)
         is_solved = jnp.sum(left.dot(left)) <= (10 * tolerance) ** 2

@@ -9,7 +9,7 @@ reverse mode, and derivatives of derivatives are right too.
 from __future__ import annotations
 
 import abc
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -18,11 +18,9 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.ad_checkpoint import checkpoint_name
-from jax.extend.core import Primitive
-from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
-from ..numerics import tied
+from ..numerics import is_zero_tangent, lanes_first, new_primitive, tied
 
 PyTree = Any
 
@@ -68,9 +66,23 @@ def implicitly(problem: ImplicitProblem, theta: PyTree, solution: PyTree) -> PyT
     return jax.tree.unflatten(y_tree, out)
 
 
-# A primitive, because a scan drops the rule of a `jax.custom_jvp` when it is differentiated: second derivatives would be wrong.
-_implicit = Primitive("jaxspring_implicit")
-_implicit.multiple_results = True
+def grown(rate: Callable[[PyTree], PyTree], theta: PyTree, time: Array, like: PyTree) -> PyTree:
+    """Zeros like `like`, whose derivative by `time` is rate(theta): what grows at that rate, when no time has passed.
+
+    The rate is computed where a derivative by `time` is taken, and nowhere else; derivatives of that derivative see theta.
+    """
+    zeros, tree = jax.tree.flatten(jax.tree.map(jnp.zeros_like, like))
+    arrays, static = eqx.partition(theta, eqx.is_array)
+    theta_leaves, theta_tree = jax.tree.flatten(arrays)
+
+    def tangent(which: tuple[int, ...], given: Sequence[Array], y: Sequence[Array], moved: Sequence[Array]) -> list[Array]:
+        if 0 not in which:
+            return [jnp.zeros_like(a) for a in y]
+        rates = jax.tree.leaves(rate(eqx.combine(jax.tree.unflatten(theta_tree, list(given[1:])), static)))
+        return [moved[0] * a for a in rates]
+
+    out = _implicit.bind(*zeros, time, *theta_leaves, tangent=tangent, n=len(zeros))
+    return jax.tree.unflatten(tree, out)
 
 
 def _values(*args: Array, tangent: Any, n: int) -> list[Array]:
@@ -80,30 +92,25 @@ def _values(*args: Array, tangent: Any, n: int) -> list[Array]:
 def _jvp(primals: Any, tangents: Any, *, tangent: Any, n: int) -> tuple[Any, Any]:
     # Once more through the primitive, so that a derivative of this derivative sees how y depends on theta.
     y = _implicit.bind(*primals, tangent=tangent, n=n)
-    which = tuple(i for i, t in enumerate(tangents[n:]) if type(t) is not ad.Zero)
+    which = tuple(i for i, t in enumerate(tangents[n:]) if not is_zero_tangent(t))
     if not which:
         return y, [jnp.zeros_like(a) for a in y]
     return y, tangent(which, primals[n:], y, [tangents[n + i] for i in which])
 
 
 def _batch(args: Any, dims: Any, *, tangent: Any, n: int) -> tuple[Any, Any]:
-    (size,) = {a.shape[d] for a, d in zip(args, dims, strict=True) if d is not None}
-    moved = [a if d is None else jnp.moveaxis(a, d, 0) for a, d in zip(args, dims, strict=True)]
-    y = [jnp.broadcast_to(a, (size, *a.shape)) if d is None else a for a, d in zip(moved[:n], dims[:n], strict=True)]
-    axes = [None if d is None else 0 for d in dims[n:]]
+    theta_first, axes = lanes_first([*args[n:], *args[:n]], [*dims[n:], *dims[:n]], len(args) - n)
+    theta, y = theta_first[: len(axes)], theta_first[len(axes) :]
 
     def over_lanes(which: tuple[int, ...], given: Sequence[Array], y: Sequence[Array], moved: Sequence[Array]) -> list[Array]:
         lane = partial(tangent, which)
-        return jax.vmap(lane, in_axes=(axes, 0, [axes[i] for i in which]))(list(given), list(y), list(moved))
+        return jax.vmap(lane, in_axes=(list(axes), 0, [axes[i] for i in which]))(list(given), list(y), list(moved))
 
-    return _implicit.bind(*y, *moved[n:], tangent=over_lanes, n=n), [0] * n
-
-
-_implicit.def_impl(_values)
-_implicit.def_abstract_eval(_values)
-ad.primitive_jvps[_implicit] = _jvp
-batching.primitive_batchers[_implicit] = _batch
-mlir.register_lowering(_implicit, mlir.lower_fun(_values, multiple_results=True))
+    return _implicit.bind(*y, *theta, tangent=over_lanes, n=n), [0] * n
 
 
-__all__ = ["SOLUTION", "ImplicitProblem", "implicitly"]
+# A primitive, because a scan drops the rule of a `jax.custom_jvp` when it is differentiated: second derivatives would be wrong.
+_implicit = new_primitive("jaxspring_implicit", _values, _values, _batch, _jvp)
+
+
+__all__ = ["SOLUTION", "ImplicitProblem", "grown", "implicitly"]

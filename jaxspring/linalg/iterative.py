@@ -99,8 +99,7 @@ class IterativeSolver(LinearSolver):
         """
         start = None if x0 is None else lax.stop_gradient(x0)
         precondition = identity if preconditioner is None else preconditioner
-        default = 1e-8 if norm(b).dtype == jnp.float64 else 1e-5
-        tolerance = self.tolerance or default
+        tolerance = self._goal(b)
 
         def forward(operator: Operator, rhs: PyTree) -> tuple[PyTree, SolveInfo]:
             return self._guarded(operator, rhs, start, precondition, tolerance)
@@ -120,12 +119,24 @@ class IterativeSolver(LinearSolver):
         x, info = self.solve(matrix, matrix.pick(b, zero), precondition, start)
         return matrix.pick(x, b), info, memory
 
+    def find_in_step(self, matrix: SpringMatrix, b: Vector, guess: Vector | None, memory: Any) -> tuple[Vector, SolveInfo, Any]:
+        """As `solve_in_step`, without a derivative."""
+        matrix, b, guess = stopped((matrix, b, guess))
+        zero = Vector.zeros_like(b)
+        start = None if guess is None else matrix.pick(guess, zero)
+        x, info = self._guarded(matrix, matrix.pick(b, zero), start, self.preconditioner.build(matrix), self._goal(b))
+        return matrix.pick(x, b), info, memory
+
+    def _goal(self, b: PyTree) -> float:
+        """Wanted residual of a solution of unit right-hand side."""
+        return self.tolerance or (1e-8 if norm(b).dtype == jnp.float64 else 1e-5)
+
     def _guarded(
         self, matvec: Operator, b: PyTree, guess: PyTree | None, precondition: Operator, tolerance: float
     ) -> tuple[PyTree, SolveInfo]:
         size = norm(b)
         is_zero = size == 0
-        scale = jnp.where(is_zero, jnp.ones_like(size), size)
+        scale = jnp.maximum(size, jnp.finfo(size.dtype).tiny)
         unit = jax.tree.map(lambda a: a / scale, b)
         start, residual = jax.tree.map(jnp.zeros_like, unit), unit
         if guess is not None:
@@ -162,11 +173,28 @@ def dot(a: PyTree, b: PyTree) -> Array:
 
 
 def norm(a: PyTree) -> Array:
-    """Euclidean norm that neither underflows nor overflows where the entries do not."""
-    largest = _reduced(jnp.maximum, jnp.max, jax.tree.map(jnp.abs, a))
-    safe = jnp.where((largest > 0) & jnp.isfinite(largest), largest, jnp.ones_like(largest))
-    scaled = jax.tree.map(lambda p: p / safe, a)
-    return safe * jnp.sqrt(dot(scaled, scaled))
+    """Euclidean norm that neither underflows nor overflows where the entries do not.
+
+    Scaled by constants, never by the largest entry: where everything fits in registers, as with a single node, XLA computes the entries
+    anew for every use, with other roundings. A residual may then be 1e-17 where it is divided and zero where it is divided by.
+    """
+    info = jnp.finfo(jax.tree.leaves(a)[0].dtype)
+    # Squares of entries up to 1 / eps below a sum of this size are still normal numbers.
+    low = float(info.tiny) ** 0.5 / float(info.eps)
+    # A power of two: no rounding.
+    scale = 2.0 ** round(-0.55 * math.log2(float(info.tiny)))
+    plain = _root(dot(a, a))
+    # Bounded, so that it stays small where the entries that it is given are not those that chose it.
+    raised = jax.tree.map(lambda p: jnp.clip(p * scale, -1 / low, 1 / low), a)
+    lowered = jax.tree.map(lambda p: p / scale, a)
+    small, large = _root(dot(raised, raised)) / scale, _root(dot(lowered, lowered)) * scale
+    return jnp.where(plain > low, jnp.where(jnp.isfinite(plain), plain, large), small)
+
+
+def _root(squared: Array) -> Array:
+    """The square root, 0 with derivative 0 below the smallest normal number."""
+    least = jnp.finfo(squared.dtype).tiny
+    return jnp.where(squared <= least, jnp.zeros_like(squared), jnp.sqrt(jnp.maximum(squared, least)))
 
 
 def _reduced(combine: Any, reduce: Any, tree: PyTree) -> Array:

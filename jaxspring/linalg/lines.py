@@ -21,6 +21,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from ..numerics import stopped
 from ..status import Flag, Status
 from ..topology.lattice import Lattice
 from ..vector import Vector
@@ -42,16 +43,25 @@ class LineSolver(LinearSolver):
 
     def solve_in_step(self, matrix: SpringMatrix, b: Vector, guess: Vector | None, memory: Any) -> tuple[Vector, SolveInfo, Any]:
         """Solve every line; `guess` is not needed."""
-        excess, weight = self._line(matrix)
+        lines = self._line(matrix)
 
         def solve(_: Any, right_side: Vector) -> tuple[Vector, SolveInfo]:
-            x = Vector((solve_lines(excess, weight, right_side[0], self.axis),))
-            bad = ~jnp.isfinite(norm(x))
-            # Its residual is rounding, and not worth a product.
-            return x, SolveInfo(jnp.zeros((), b.dtype), jnp.zeros((), jnp.int32), Status.when(Flag.NONFINITE, bad))
+            return self._solved(*lines, right_side)
 
         x, info = lax.custom_linear_solve(matrix, matrix.pick(b, Vector.zeros_like(b)), solve, symmetric=True, has_aux=True)
         return matrix.pick(x, b), info, memory
+
+    def find_in_step(self, matrix: SpringMatrix, b: Vector, guess: Vector | None, memory: Any) -> tuple[Vector, SolveInfo, Any]:
+        """As `solve_in_step`, without a derivative."""
+        matrix, b = stopped((matrix, b))
+        x, info = self._solved(*self._line(matrix), matrix.pick(b, Vector.zeros_like(b)))
+        return matrix.pick(x, b), info, memory
+
+    def _solved(self, excess: Array, weight: Array, b: Vector) -> tuple[Vector, SolveInfo]:
+        x = Vector((solve_lines(excess, weight, b[0], self.axis),))
+        bad = ~jnp.isfinite(norm(x))
+        # Its residual is rounding, and not worth a product.
+        return x, SolveInfo(jnp.zeros((), b.dtype), jnp.zeros((), jnp.int32), Status.when(Flag.NONFINITE, bad))
 
     def _line(self, matrix: SpringMatrix) -> tuple[Array, Array]:
         """Excess of the diagonal at each node, and weight of the spring to the next node (zero after the last)."""

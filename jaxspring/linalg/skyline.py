@@ -117,6 +117,15 @@ class Skyline(LinearSolver):
         x, info = lax.custom_linear_solve(matrix, matrix.pick(b, Vector.zeros_like(b)), solve, symmetric=True, has_aux=True)
         return matrix.pick(x, b), info, memory
 
+    def find_in_step(
+        self, matrix: SpringMatrix, b: Vector, guess: Vector | None, memory: SkylineMemory | None
+    ) -> tuple[Vector, SolveInfo, SkylineMemory]:
+        """As `solve_in_step`, without a derivative."""
+        matrix, b = stopped((matrix, b))
+        memory = self.init(matrix) if memory is None else self._renewed(matrix, memory)
+        x, info = _guarded(memory.factor, matrix, matrix.pick(b, Vector.zeros_like(b)))
+        return matrix.pick(x, b), info, memory
+
     def _renewed(self, matrix: SpringMatrix, memory: SkylineMemory) -> SkylineMemory:
         classes, found = memory.factor.classes, alike_coordinates(matrix)
         if not all(any(set(kept) <= set(groups) for groups in found) for kept in classes):
@@ -230,7 +239,7 @@ def _guarded(factor: SkylineFactor, operator: Callable[[Vector], Vector], b: Vec
     """Solve, correct by the residual where that pays, and look at what is left."""
     size = norm(b)
     is_zero = size == 0
-    scale = jnp.where(is_zero, jnp.ones_like(size), size)
+    scale = jnp.maximum(size, jnp.finfo(size.dtype).tiny)
     unit = b / scale
     x = factor.solve(unit)
     left = unit - operator(x)

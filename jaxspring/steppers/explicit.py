@@ -67,7 +67,7 @@ class VelocityVerlet(Stepper):
         """Drift with the old acceleration, kick with the mean of old and new."""
         a = memory
         x = state.position + dt * (state.velocity + (0.5 * dt) * a)
-        predicted = state.moved(x, state.velocity + dt * a, state.time + dt)
+        predicted = system.stage(state.moved(x, state.velocity + dt * a, state.time + dt))
         a_new = system.acceleration(predicted)
         return state.moved(x, state.velocity + (0.5 * dt) * (a + a_new)), a_new
 
@@ -87,7 +87,7 @@ class RungeKutta4(Stepper):
                 stage = state
             else:
                 at = state.time + fraction * dt
-                stage = state.moved(state.position + (fraction * dt) * dx, state.velocity + (fraction * dt) * dv, at)
+                stage = system.stage(state.moved(state.position + (fraction * dt) * dx, state.velocity + (fraction * dt) * dv, at))
             return stage.velocity, system.acceleration(stage)
 
         x1, v1 = slope(0.0, None, None)

@@ -27,6 +27,7 @@ from ..forces.linearisation import Linearisation, Tangent
 from ..linalg.base import LinearSolver, SolveInfo
 from ..linalg.cg import JaxCG
 from ..linalg.exact import ExactSolver
+from ..linalg.implicit import grown
 from ..linalg.iterative import norm
 from ..numerics import stopped
 from ..state import State
@@ -35,7 +36,10 @@ from ..system import Energy, System
 from ..vector import Vector
 from .base import Stepper
 from .newton import Newton, NewtonStage
-from .stage import LinearStage, Stage, known_velocity
+from .stage import LinearStage, Stage, known_velocities
+
+# Stands for a dt of zero [s].
+_SHORT = 1e-10
 
 
 class Memory(eqx.Module):
@@ -130,9 +134,12 @@ class ImplicitStepper(Stepper):
     def step(self, system: System, state: State, dt: Array, memory: Memory) -> tuple[State, Memory]:
         """One stage, and the state after it; with dt = 0, which no matrix survives, the state itself."""
         stands = dt == 0
-        new, after = self._step(system, state, jnp.where(stands, jnp.ones_like(dt), dt), memory)
+        # In so short a step masses outweigh all else: what is computed in vain never fails.
+        new, after = self._step(system, state, jnp.where(stands, jnp.asarray(_SHORT, dt.dtype), dt), memory)
         after = eqx.tree_at(lambda m: m.info.status, after, after.info.status.only_if(~stands))
-        return jax.tree.map(lambda old, moved: jnp.where(stands, old, moved), state, new), after
+        dx, dv = grown(_rates, (system, state), dt, (state.position, state.velocity))
+        old = state.moved(state.position + dx, state.velocity + dv, new.time)
+        return jax.tree.map(lambda old, moved: jnp.where(stands, old, moved), old, new), after
 
     def _step(self, system: System, state: State, dt: Array, memory: Memory) -> tuple[State, Memory]:
         stage = self.stage(system, state, dt, memory.history)
@@ -244,6 +251,12 @@ class BDF2(ImplicitStepper):
         return 0.1
 
 
+def _rates(scene: tuple[System, State]) -> tuple[Vector, Vector]:
+    """How fast positions and velocities change."""
+    system, state = scene
+    return state.velocity, system.acceleration(state)
+
+
 def _closed_energy(system: System, state: State) -> Energy | None:
     """The energy of a state, if nothing in the system can feed energy in."""
     if system.motion is not None or any(force.can_feed(state) for force in system.forces):
@@ -266,7 +279,7 @@ def _breakdown(stage: Stage, after: State) -> Status:
 
 def _stage(system: System, state: State, origin: Vector, velocity: Vector, h: Array, time: Array) -> Stage:
     predictor = state.moved(state.position, state.velocity, time)
-    return Stage(system, origin, velocity, h, time, predictor, known_velocity(system, origin, h, time), origin is state.position)
+    return Stage(system, origin, velocity, h, time, predictor, *known_velocities(system, origin, h, time), origin is state.position)
 
 
 __all__ = ["BDF2", "BackwardEuler", "ImplicitMidpoint", "ImplicitStepper"]

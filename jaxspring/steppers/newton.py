@@ -20,12 +20,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array
 
 from ..forces.linearisation import Tangent
 from ..linalg.base import LinearSolver, SolveInfo
 from ..linalg.exact import Converged
-from ..linalg.implicit import implicitly
+from ..linalg.implicit import SOLUTION, implicitly
 from ..linalg.iterative import IterativeSolver
 from ..linalg.operators import SpringMatrix
 from ..linalg.preconditioners import BlockJacobi
@@ -105,7 +106,7 @@ class NewtonStage(Converged):
         failed = end.status.then(Status.when(Flag.SOLVER, ~converged))
         status = jax.tree.map(lambda ok, bad: jnp.where(converged, ok, bad), Status.ok(), failed)
         relative = end.norm / jnp.where(scale > 0, scale, jnp.ones_like(scale))
-        trust = jnp.where(converged, jnp.ones_like(scale), jnp.full_like(scale, jnp.nan))
+        trust = checkpoint_name(jnp.where(converged, jnp.ones_like(scale), jnp.full_like(scale, jnp.nan)), SOLUTION)
         problem = NewtonStage(self.adjoint, trust, self.solver, self.options)
         return implicitly(problem, stage, end.y), SolveInfo(relative, end.iterations, status), end.memory
 
@@ -144,7 +145,7 @@ class NewtonStage(Converged):
         matrix = stage.matrix(stage.reached(at.y), Tangent())
 
         def clamped(_: None) -> tuple[Vector, Array, Status, Any]:
-            d, info, memory = self.solver.solve_in_step(matrix, -at.r, None, at.memory)
+            d, info, memory = self.solver.find_in_step(matrix, -at.r, None, at.memory)
             return d, jnp.maximum(info.iterations, 0), info.status, memory
 
         if not self._has_potential(stage):

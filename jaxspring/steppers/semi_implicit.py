@@ -67,7 +67,7 @@ class SemiImplicit(Stepper):
             return _moved(state, dt, system.hold(dv)), None
         dv, info, carried = _Solve(self.solver).solve(kick, memory.solver)
         new = _moved(state, dt, dv)
-        given = Stage(system, state.position, state.velocity, dt, state.time, state, kick.known(), True)
+        given = Stage(system, state.position, state.velocity, dt, state.time, state, kick.known(), None, True)
         status = _breakdown(given, new).then(info.status)
         return new, Memory(carried, SolveInfo(info.residual, info.iterations, status), None, None)
 
@@ -144,7 +144,7 @@ class _Solve(ImplicitProblem):
         right_side = still.impulse()
         if still.system.motion is not None:
             right_side = right_side - matrix.blocks.product(matrix.pick(Vector.zeros_like(known), known))
-        dv, info, memory = self.solver.solve_in_step(matrix, matrix.pick(right_side, known), None, memory)
+        dv, info, memory = self.solver.find_in_step(matrix, matrix.pick(right_side, known), None, memory)
         return implicitly(self, kick, dv), info, memory
 
 

@@ -42,7 +42,8 @@ class Stage(eqx.Module):
         h: [s].
         time: t [s], when the forces are taken.
         predictor: the state at which forces are linearised.
-        known: velocity of held and moved coordinates [m/s], zero elsewhere.
+        known: velocity of held and moved coordinates [m/s] that leads to their place at t, zero elsewhere.
+        scheduled: velocity of moved coordinates at t [m/s], zero elsewhere, which damping feels; None where nothing is moved.
         starts_there: whether x0 is the predictor's position (static).
     """
 
@@ -53,6 +54,7 @@ class Stage(eqx.Module):
     time: Array
     predictor: State
     known: Vector
+    scheduled: Vector | None
     starts_there: bool = eqx.field(static=True)
 
     def full(self, y: Vector) -> Vector:
@@ -62,7 +64,10 @@ class Stage(eqx.Module):
     def reached(self, y: Vector) -> State:
         """The state that the velocity `y` leads to."""
         v = self.full(y)
-        return self.predictor.moved(self.origin + self.h * v, v, self.time)
+        x = self.origin + self.h * v
+        if self.scheduled is not None:
+            v = self.system.matrix(Blocks(), self.predictor).pick(v, self.scheduled)
+        return self.predictor.moved(x, v, self.time)
 
     def inertia(self, y: Vector) -> Vector:
         """M (y - v0) / h [N]."""
@@ -121,27 +126,32 @@ class LinearStage(ImplicitProblem):
         if still.system.motion is not None:
             right_side = right_side - matrix.blocks.product(still.known)
         zero = Vector.zeros_like(right_side)
-        y, info, memory = self.solver.solve_in_step(matrix, still.on_free(right_side, zero), still.predictor.velocity, memory)
+        y, info, memory = self.solver.find_in_step(matrix, still.on_free(right_side, zero), still.predictor.velocity, memory)
         return implicitly(self, stage, y), info, memory
 
     def _right_side(self, stage: Stage) -> Vector:
         """B = M v0 / h + f_p + G v_p - K (x0 - x_p) [N]."""
         at = stage.predictor
         b = (stage.system.mass.astype(at.dtype) / stage.h) * stage.velocity + stage.system.force(at)
-        b = b + stage.system.damping_blocks(at).product(at.velocity)
+        damping = stage.system.damping_blocks(at)
+        b = b + damping.product(at.velocity)
+        if stage.scheduled is not None:
+            # A takes moved nodes at the velocity that leads to their place.
+            b = b - damping.product(stage.scheduled - stage.known)
         if stage.starts_there:
             return b
         return b - stage.system.stiffness_blocks(at, self.linearisation).product(stage.origin - at.position)
 
 
-def known_velocity(system: System, origin: Vector, h: Array, time: Array) -> Vector:
-    """Velocity of the held (zero) and of the moved coordinates, which reach their scheduled place at `time` [m/s]."""
+def known_velocities(system: System, origin: Vector, h: Array, time: Array) -> tuple[Vector, Vector | None]:
+    """Of the held (zero) and of the moved coordinates, the velocity that leads to their place at `time` and that at `time` [m/s]."""
     zero = Vector.zeros_like(origin)
     if system.motion is None:
-        return zero
-    place, _ = system.motion.at(time)
+        return zero, None
+    place, velocity = system.motion.at(time)
     moved = system.motion.moved
-    return zero.map(lambda z, to, x: jnp.where(moved, ((to.astype(x.dtype) - x) / h), z), place, origin)
+    known = zero.map(lambda z, to, x: jnp.where(moved, ((to.astype(x.dtype) - x) / h), z), place, origin)
+    return known, zero.map(lambda z, v: jnp.where(moved, v.astype(z.dtype), z), velocity)
 
 
-__all__ = ["LinearStage", "Stage", "known_velocity"]
+__all__ = ["LinearStage", "Stage", "known_velocities"]

@@ -17,14 +17,15 @@ Source: backward Euler, in the conservative form of the slide "Heating and Melti
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from ..linalg.base import LinearSolver
+from ..linalg.base import LinearSolver, SolveInfo
 from ..linalg.implicit import ImplicitProblem, implicitly
 from ..linalg.iterative import norm
 from ..linalg.operators import SpringMatrix
@@ -33,6 +34,8 @@ from ..status import Flag, Status
 from ..vector import Vector
 from .flow import Flow
 from .phase import Equation, relaxed, searched
+
+SolveInStep = Callable[..., tuple[Vector, SolveInfo, Any]]
 
 
 class HeatIteration(eqx.Module):
@@ -100,7 +103,7 @@ class BackwardStep(ImplicitProblem):
         held, melting = flow.held(), flow.is_melting(y)
         given = jnp.zeros_like(right_side) if held is None else jnp.where(held, right_side, jnp.zeros_like(right_side))
         pushed = right_side if held is None else right_side - _times(matrix, self._warmed(given, melting))
-        dtheta = self._change(matrix, pushed, None)[0]
+        dtheta = self._change(matrix, pushed, self.solver.solve_in_step, None)[0]
         if held is not None:
             dtheta = jnp.where(held, self._warmed(given, melting), dtheta)
         change = dtheta if held is None else jnp.where(held, given, dtheta)
@@ -113,12 +116,12 @@ class BackwardStep(ImplicitProblem):
         """Change of temperature of a change of y."""
         return dy if melting is None else jnp.where(melting, jnp.zeros_like(dy), dy)
 
-    def _change(self, matrix: SpringMatrix, right_side: Array, guess: Array | None) -> tuple[Array, Status]:
-        """The matrix' solution over the free nodes, zero for the others."""
+    def _change(self, matrix: SpringMatrix, right_side: Array, solve: SolveInStep, guess: Array | None) -> tuple[Array, Status]:
+        """The matrix' solution over the free nodes by one of the solver's two ways, zero for the others."""
         zero = Vector((jnp.zeros_like(right_side),))
         start = None if guess is None else Vector((guess,))
         b = matrix.pick(Vector((right_side,)), zero)
-        x, info, _ = self.solver.solve_in_step(matrix, b, start, self.solver.init(matrix))
+        x, info, _ = solve(matrix, b, start, self.solver.init(matrix))
         return matrix.pick(x, zero)[0], info.status
 
     def _improved(self, equation: Equation, stand: _Stand) -> _Stand:
@@ -140,7 +143,7 @@ class BackwardStep(ImplicitProblem):
         before = matrix.pick(Vector((jnp.where(is_first, over, zero[0]),)), zero)
         right_side = jnp.where(is_first, _afresh(equation, matrix, y, over), missing)
         guess = matrix.pick(before + _rise(matrix, missing), zero)[0]
-        after, status = self._change(matrix, right_side, guess)
+        after, status = self._change(matrix, right_side, self.solver.find_in_step, guess)
         dtheta = after - before[0]
         y = y + dtheta if flow.latent is None else searched(equation, matrix, y, missing, dtheta)
         return _Stand(y, equation.missing(y), stand.n_done + 1, status)

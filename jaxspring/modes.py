@@ -23,6 +23,7 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array
 
+from ._arrays import given
 from ._checks import as_inexact, finite, has_shape, is_concrete, shape_of
 from .forces.linearisation import ExactTangent
 from .linalg.eigen import lowest_eigenpairs, symmetric_eigen
@@ -122,9 +123,9 @@ def frequency_response(system: System, state: State, frequencies: Any, force: An
     n = int(np.prod(state.position.shape)) * state.dim
     if n > LARGEST_DENSE:
         raise ValueError(f"{n} unknowns (nodes times coordinates); the dense matrix of a frequency response may have {LARGEST_DENSE}.")
-    load = force if hasattr(force, "dtype") else np.asarray(force)
+    load = given("force", force)
     has_shape("force", load, {"per node and coordinate": (n // state.dim, state.dim)})
-    parts = as_inexact("force", jnp.real(load), state.dtype), as_inexact("force", jnp.imag(load), state.dtype)
+    parts = as_inexact("force", load.real, state.dtype), as_inexact("force", load.imag, state.dtype)
     frequencies = as_inexact("frequencies", frequencies, state.dtype)
     for name, value in (("force", parts[0]), ("force", parts[1]), ("frequencies", frequencies)):
         finite(name, value)

@@ -9,6 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ._arrays import kept
 from ._checks import as_inexact, finite, has_shape
 from .topology.base import NodeLayout, Topology
 from .topology.edge_field import EdgeField
@@ -33,12 +34,12 @@ class State(eqx.Module):
     What is None is not there: it costs nothing, and its effect is not in the scene.
     """
 
-    time: Array
+    time: Array = eqx.field(converter=kept)
     position: Vector
     velocity: Vector
     layout: NodeLayout = eqx.field(static=True)
-    temperature: Array | None = None
-    enthalpy: Array | None = None
+    temperature: Array | None = eqx.field(converter=kept, default=None)
+    enthalpy: Array | None = eqx.field(converter=kept, default=None)
     alive: EdgeField | None = None
     rest_length: EdgeField | None = None
     neighbours: Any = None
@@ -71,7 +72,10 @@ class State(eqx.Module):
             has_shape("temperature", temperature, {"one number": (), "one per node": (net.n_nodes,), "node shape": net.node_shape})
             finite("temperature", temperature)
             temperature = jnp.broadcast_to(net.node_field(temperature, "temperature"), net.node_shape)
-        return State(jnp.asarray(time, position.dtype), position, velocity, net.layout, temperature)
+        time = as_inexact("time", time, position.dtype)
+        has_shape("time", time, {"one number": ()})
+        finite("time", time)
+        return State(time, position, velocity, net.layout, temperature)
 
     def moved(self, position: Vector, velocity: Vector, time: Array | None = None) -> State:
         """The state at another place, velocity and (where given) time, all else as it is."""

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ._arrays import as_indices, as_mask, kept
 from ._checks import as_inexact, has_shape, positive, shape_of
 from .forces.base import Force, Rule
 from .forces.linearisation import Linearisation
@@ -54,7 +55,7 @@ class Motion(eqx.Module):
         path: (time [s]) -> `Vector` of positions in node shape [m]; its derivative in time is the velocity.
     """
 
-    moved: Array
+    moved: Array = eqx.field(converter=kept)
     path: Callable[[Array], Vector]
 
     def at(self, time: Array) -> tuple[Vector, Vector]:
@@ -277,7 +278,7 @@ def lumped_mass(net: Topology, points: Any, density: Any, triangles: Any = None)
     if triangles is None:
         lengths = net.lengths(points)
         return net.flatten_nodes(net.incident_sum(net.split(0.5 * density * lengths)))
-    corners = np.asarray(triangles)
+    corners = as_indices("triangles", triangles)
     a, b, c = (points[corners[:, i]] for i in range(3))
     u, v = b - a, c - a
     squared = jnp.sum(u * u, axis=1) * jnp.sum(v * v, axis=1) - jnp.sum(u * v, axis=1) ** 2
@@ -288,10 +289,7 @@ def lumped_mass(net: Topology, points: Any, density: Any, triangles: Any = None)
 def _as_free(net: Topology, free: Any) -> Free:
     if free is None:
         return None
-    if not hasattr(free, "dtype"):
-        free = np.asarray(free)
-    if free.dtype != np.bool_:
-        raise TypeError(f"free has dtype {free.dtype}; expected booleans: True moves, False is held. Node numbers are not accepted.")
+    free = as_mask("free", free, ": True moves, False is held")
     if len(shape_of(free)) == 2 and free.shape != net.node_shape:
         has_shape("free", free, {"per node": (net.n_nodes,), "per node and coordinate": (net.n_nodes, min(free.shape[1], 3))})
         return tuple(net.node_field(free[:, i], "free") for i in range(free.shape[1]))

@@ -79,7 +79,7 @@ def normal_modes(system: System, state: State, n_modes: int | None = None) -> Mo
     >>> print(normal_modes(system, js.State.from_points(net, net.grid()), n_modes=2).frequencies.round(3))
     [0. 2.]
     """
-    n = int(np.prod(state.position.shape)) * state.dim
+    n = int(np.prod(state.checked().position.shape)) * state.dim
     n_free = _count_free(system, state)
     if n_modes is not None and not 0 < n_modes <= n_free:
         raise ValueError(f"n_modes = {n_modes}, but the system has {n_free} free coordinates; expected 1 to {n_free}.")
@@ -120,7 +120,7 @@ def frequency_response(system: System, state: State, frequencies: Any, force: An
     >>> print(f"{abs(u[1, 0]):.3f}")  # at resonance F / (c w)
     3.000
     """
-    n = int(np.prod(state.position.shape)) * state.dim
+    n = int(np.prod(state.checked().position.shape)) * state.dim
     if n > LARGEST_DENSE:
         raise ValueError(f"{n} unknowns (nodes times coordinates); the dense matrix of a frequency response may have {LARGEST_DENSE}.")
     load = given("force", force)

@@ -119,7 +119,7 @@ def diffeqsolve(
     import diffrax
 
     solver = diffrax.Tsit5() if solver is None else solver
-    _check_times(state, t1, dt0)
+    _check_times(state.checked(), t1, dt0)
     if system.rules:
         names = ", ".join(type(rule).__name__ for rule in system.rules)
         raise ValueError(f"{names} acts after steps of fixed length, which an adaptive solver does not take. Use rollout.")

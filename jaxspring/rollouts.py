@@ -139,7 +139,7 @@ def rollout(
     1.0
     """
     _check_steps(n_steps, save_every, observe, check_every)
-    dt = as_inexact("dt", dt, state.dtype)
+    dt = as_inexact("dt", dt, state.checked().dtype)
     has_shape("dt", dt, {"one number": ()})
     if is_concrete(dt):
         finite("dt", dt)

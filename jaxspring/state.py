@@ -6,6 +6,7 @@ import dataclasses
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -81,6 +82,26 @@ class State(eqx.Module):
         """The state at another place, velocity and (where given) time, all else as it is."""
         time = self.time if time is None else time
         return dataclasses.replace(self, time=time, position=position, velocity=velocity)
+
+    def checked(self) -> State:
+        """The state itself, where a system can take it. Whatever takes a state asks here.
+
+        Raises:
+            TypeError: float64 while JAX's x64 is off.
+            ValueError: a leading axis of states or frames, outside of `jax.vmap`.
+        """
+        if jax.dtypes.canonicalize_dtype(self.dtype) != self.dtype:
+            raise TypeError(
+                f"the state is {self.dtype}, but x64 is switched off, so that JAX would mix it with float32. Switch it on again with "
+                f"jax.config.update('jax_enable_x64', True), or make the state anew: it is float32 then."
+            )
+        if self.position.shape != self.layout.shape:
+            raise ValueError(
+                f"the state's positions have shape {self.position.shape}, those of one state {self.layout.shape}: these are many states (a "
+                f"batch, or the frames of a run). Take one, jax.tree.map(lambda a: a[0], states), or all by jax.vmap: "
+                f"jax.vmap(lambda state: ...)(states)."
+            )
+        return self
 
     @property
     def points(self) -> Array:

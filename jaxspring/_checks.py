@@ -15,6 +15,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
+from ._arrays import as_indices, given, own
+
 
 def shape_of(value: Any) -> tuple[int, ...]:
     """Shape of an array, a tracer, a number or a shape struct."""
@@ -29,10 +31,12 @@ def is_concrete(value: Any) -> bool:
 
 
 def as_inexact(name: str, value: Any, dtype: Any = None) -> Array:
-    """`value` as a float32 or float64 array: integers are converted, half precision and complex numbers refused."""
-    if isinstance(value, (list, tuple)):
-        value = np.asarray(value)
-    kind = jnp.result_type(value)
+    """`value` as a float32 or float64 array of the library's own: integers are converted, half precision and complex numbers refused.
+
+    What is no array of JAX is copied: the caller may change it afterwards. Lists may hold traced numbers.
+    """
+    array = given(name, value)
+    kind = array.dtype
     if kind == jnp.bool_ or not (jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer)):
         raise TypeError(f"{name} has dtype {kind}; expected real numbers. Convert it, e.g. {name}.astype(float).")
     if jnp.issubdtype(kind, jnp.floating) and jnp.finfo(kind).bits < 32:
@@ -41,8 +45,9 @@ def as_inexact(name: str, value: Any, dtype: Any = None) -> Array:
             f"Use float32 or float64, e.g. {name}.astype('float32')."
         )
     if dtype is None:
-        dtype = kind if jnp.issubdtype(kind, jnp.floating) else jnp.result_type(float)
-    return jnp.asarray(value, jax.dtypes.canonicalize_dtype(dtype))
+        is_single = jnp.issubdtype(kind, jnp.floating) and kind.itemsize == 4
+        dtype = np.float32 if is_single else jnp.result_type(float)
+    return own(name, array, jax.dtypes.canonicalize_dtype(dtype))
 
 
 def finite(name: str, value: Any) -> None:
@@ -113,13 +118,9 @@ def has_shape(name: str, value: Any, allowed: dict[str, tuple[int, ...]]) -> Non
 
 def node_indices(name: str, edges: Any, n_nodes: int) -> np.ndarray:
     """`edges` as an (E, 2) integer array whose every entry names a node 0 ... n_nodes - 1."""
-    array = np.asarray(edges)
+    array = as_indices(name, edges)
     if array.size == 0:
         return np.zeros((0, 2), np.int32)
-    if array.dtype == np.bool_ or not np.issubdtype(array.dtype, np.integer):
-        raise TypeError(
-            f"{name} has dtype {array.dtype}, e.g. {name}[0] = {array[0]}; expected integer node numbers. JAX would read a bool as a mask."
-        )
     if array.ndim != 2 or array.shape[1] != 2:
         raise ValueError(f"{name} has shape {array.shape}; expected (E, 2): tail and head node of each spring.")
     bad = (array < 0) | (array >= n_nodes)

@@ -23,6 +23,7 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array
 
+from ._arrays import given
 from ._checks import as_inexact, finite, has_shape, is_concrete, shape_of
 from .forces.linearisation import ExactTangent
 from .linalg.eigen import lowest_eigenpairs, symmetric_eigen
@@ -78,7 +79,7 @@ def normal_modes(system: System, state: State, n_modes: int | None = None) -> Mo
     >>> print(normal_modes(system, js.State.from_points(net, net.grid()), n_modes=2).frequencies.round(3))
     [0. 2.]
     """
-    n = int(np.prod(state.position.shape)) * state.dim
+    n = int(np.prod(state.checked().position.shape)) * state.dim
     n_free = _count_free(system, state)
     if n_modes is not None and not 0 < n_modes <= n_free:
         raise ValueError(f"n_modes = {n_modes}, but the system has {n_free} free coordinates; expected 1 to {n_free}.")
@@ -119,12 +120,12 @@ def frequency_response(system: System, state: State, frequencies: Any, force: An
     >>> print(f"{abs(u[1, 0]):.3f}")  # at resonance F / (c w)
     3.000
     """
-    n = int(np.prod(state.position.shape)) * state.dim
+    n = int(np.prod(state.checked().position.shape)) * state.dim
     if n > LARGEST_DENSE:
         raise ValueError(f"{n} unknowns (nodes times coordinates); the dense matrix of a frequency response may have {LARGEST_DENSE}.")
-    load = force if hasattr(force, "dtype") else np.asarray(force)
+    load = given("force", force)
     has_shape("force", load, {"per node and coordinate": (n // state.dim, state.dim)})
-    parts = as_inexact("force", jnp.real(load), state.dtype), as_inexact("force", jnp.imag(load), state.dtype)
+    parts = as_inexact("force", load.real, state.dtype), as_inexact("force", load.imag, state.dtype)
     frequencies = as_inexact("frequencies", frequencies, state.dtype)
     for name, value in (("force", parts[0]), ("force", parts[1]), ("frequencies", frequencies)):
         finite(name, value)

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ._checks import finite, is_concrete
+from ._checks import as_inexact, finite, is_concrete
 from .state import State
 from .status import Flag, Status
 from .system import System
@@ -70,7 +70,7 @@ class OdeResult(eqx.Module):
         """The state at any time [s] between the start and the end; needs `saveat=diffrax.SaveAt(dense=True)`."""
         if self.info.interpolation is None:
             raise ValueError("this result keeps no interpolation. Pass saveat=diffrax.SaveAt(dense=True) to diffeqsolve.")
-        time = jnp.asarray(time, self.state.dtype)
+        time = as_inexact("time", time, self.state.dtype)
         position, velocity = self.info.interpolation.evaluate(time)
         return self.state.moved(position, velocity, time)
 
@@ -119,12 +119,12 @@ def diffeqsolve(
     import diffrax
 
     solver = diffrax.Tsit5() if solver is None else solver
-    _check_times(state, t1, dt0)
+    _check_times(state.checked(), t1, dt0)
     if system.rules:
         names = ", ".join(type(rule).__name__ for rule in system.rules)
         raise ValueError(f"{names} acts after steps of fixed length, which an adaptive solver does not take. Use rollout.")
-    t1 = jnp.asarray(t1, state.dtype)
-    dt0 = None if dt0 is None else jnp.asarray(dt0, state.dtype)
+    t1 = as_inexact("t1", t1, state.dtype)
+    dt0 = None if dt0 is None else as_inexact("dt0", dt0, state.dtype)
     if stepsize_controller is None:
         tolerance = float(jnp.finfo(state.dtype).eps) ** 0.5
         is_constant = dt0 is not None

@@ -21,7 +21,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
-from ._checks import finite, is_concrete
+from ._checks import as_inexact, finite, has_shape, is_concrete
 from .blocks import Adjoint, Checkpointed, Plan, make_plan, run_blocks
 from .linalg.base import SolveInfo
 from .numerics import is_traced, stopped
@@ -139,11 +139,12 @@ def rollout(
     1.0
     """
     _check_steps(n_steps, save_every, observe, check_every)
+    dt = as_inexact("dt", dt, state.checked().dtype)
+    has_shape("dt", dt, {"one number": ()})
     if is_concrete(dt):
         finite("dt", dt)
-        if np.any(np.asarray(dt) < 0) and not stepper.runs_backward:
+        if np.asarray(dt) < 0 and not stepper.runs_backward:
             raise ValueError(f"dt = {dt}, but {type(stepper).__name__} does not run backward. Use VelocityVerlet(), or a positive dt.")
-    dt = jnp.asarray(dt, state.dtype)
     plan = make_plan(n_steps, save_every, Checkpointed() if adjoint is None else adjoint, check_every)
     resume = Resume(state.time, jnp.zeros((), jnp.int32), _Unset()) if resume is None else resume
     job = _Job(stepper, dt, observe, plan, keep_solves)

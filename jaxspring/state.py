@@ -6,9 +6,11 @@ import dataclasses
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ._arrays import kept
 from ._checks import as_inexact, finite, has_shape
 from .topology.base import NodeLayout, Topology
 from .topology.edge_field import EdgeField
@@ -33,12 +35,12 @@ class State(eqx.Module):
     What is None is not there: it costs nothing, and its effect is not in the scene.
     """
 
-    time: Array
+    time: Array = eqx.field(converter=kept)
     position: Vector
     velocity: Vector
     layout: NodeLayout = eqx.field(static=True)
-    temperature: Array | None = None
-    enthalpy: Array | None = None
+    temperature: Array | None = eqx.field(converter=kept, default=None)
+    enthalpy: Array | None = eqx.field(converter=kept, default=None)
     alive: EdgeField | None = None
     rest_length: EdgeField | None = None
     neighbours: Any = None
@@ -71,12 +73,35 @@ class State(eqx.Module):
             has_shape("temperature", temperature, {"one number": (), "one per node": (net.n_nodes,), "node shape": net.node_shape})
             finite("temperature", temperature)
             temperature = jnp.broadcast_to(net.node_field(temperature, "temperature"), net.node_shape)
-        return State(jnp.asarray(time, position.dtype), position, velocity, net.layout, temperature)
+        time = as_inexact("time", time, position.dtype)
+        has_shape("time", time, {"one number": ()})
+        finite("time", time)
+        return State(time, position, velocity, net.layout, temperature)
 
     def moved(self, position: Vector, velocity: Vector, time: Array | None = None) -> State:
         """The state at another place, velocity and (where given) time, all else as it is."""
         time = self.time if time is None else time
         return dataclasses.replace(self, time=time, position=position, velocity=velocity)
+
+    def checked(self) -> State:
+        """The state itself, where a system can take it. Whatever takes a state asks here.
+
+        Raises:
+            TypeError: float64 while JAX's x64 is off.
+            ValueError: a leading axis of states or frames, outside of `jax.vmap`.
+        """
+        if jax.dtypes.canonicalize_dtype(self.dtype) != self.dtype:
+            raise TypeError(
+                f"the state is {self.dtype}, but x64 is switched off, so that JAX would mix it with float32. Switch it on again with "
+                f"jax.config.update('jax_enable_x64', True), or make the state anew: it is float32 then."
+            )
+        if self.position.shape != self.layout.shape:
+            raise ValueError(
+                f"the state's positions have shape {self.position.shape}, those of one state {self.layout.shape}: these are many states (a "
+                f"batch, or the frames of a run). Take one, jax.tree.map(lambda a: a[0], states), or all by jax.vmap: "
+                f"jax.vmap(lambda state: ...)(states)."
+            )
+        return self
 
     @property
     def points(self) -> Array:

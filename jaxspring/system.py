@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ._arrays import as_indices, as_mask, kept
 from ._checks import as_inexact, has_shape, positive, shape_of
 from .forces.base import Force, Rule
 from .forces.linearisation import Linearisation
@@ -54,7 +55,7 @@ class Motion(eqx.Module):
         path: (time [s]) -> `Vector` of positions in node shape [m]; its derivative in time is the velocity.
     """
 
-    moved: Array
+    moved: Array = eqx.field(converter=kept)
     path: Callable[[Array], Vector]
 
     def at(self, time: Array) -> tuple[Vector, Vector]:
@@ -106,7 +107,20 @@ class System(eqx.Module):
 
     def _cast(self, effect: Force, state: State) -> Force:
         """The effect in its system, and constants of the state's dtype: float32 in, float32 out, whatever the constants were."""
-        return cast_inexact(effect.with_mass(self.mass).with_forces(self.forces), state.dtype)
+        return cast_inexact(effect.with_mass(self.mass).with_forces(self.forces), self._taken(state).dtype)
+
+    def _taken(self, state: State) -> State:
+        """The state, where this is one system and that one state, which JAX can compute."""
+        self._refuse_stack()
+        return state.checked()
+
+    def _refuse_stack(self) -> None:
+        rank = len(self.net.node_shape)
+        if shape_of(self.mass) not in ((), self.net.node_shape) or any(len(shape) != rank for shape in self.net.family_shapes):
+            raise ValueError(
+                f"the system's mass has shape {shape_of(self.mass)}, that of one system () or {self.net.node_shape}: these are many systems, "
+                f"stacked. Run them by jax.vmap(lambda system: ...)(systems); nets of other springs cannot be stacked, but run one by one."
+            )
 
     def _adopt(self, i: int, force: Any) -> Force:
         if isinstance(force, Rule) and not isinstance(force, Force):
@@ -159,6 +173,7 @@ class System(eqx.Module):
 
     def prepare(self, dtype: Any) -> System:
         """The system as a loop wants it: every constant in the shape of the topology and of `dtype`."""
+        self._refuse_stack()
         alone = tuple(f.with_mass(self.mass).prepare(dtype) for f in self.forces)
         forces = tuple(f.with_forces(alone) for f in alone)
         ready = eqx.tree_at(lambda s: s.forces, self, forces)
@@ -216,7 +231,7 @@ class System(eqx.Module):
 
     def constrain(self, state: State) -> State:
         """The state with held nodes at rest and moved nodes on their schedule."""
-        state = eqx.tree_at(lambda s: s.velocity, state, self.hold(state.velocity))
+        state = eqx.tree_at(lambda s: s.velocity, self._taken(state), self.hold(state.velocity))
         if self.motion is None:
             return state
         position, velocity = self.motion.at(state.time)
@@ -235,16 +250,16 @@ class System(eqx.Module):
 
     def energy(self, state: State) -> Energy:
         """Kinetic energy and each force's potential [J]."""
-        kinetic = 0.5 * jnp.sum(self.mass.astype(state.dtype) * state.velocity.dot(state.velocity))
+        kinetic = 0.5 * jnp.sum(self.mass.astype(self._taken(state).dtype) * state.velocity.dot(state.velocity))
         return Energy(kinetic, tuple(self._cast(f, state).energy(state) for f in self.forces))
 
     def momentum(self, state: State) -> Array:
         """(D,) total momentum [kg m/s]."""
-        return jnp.stack([jnp.sum(self.mass.astype(state.dtype) * a) for a in state.velocity])
+        return jnp.stack([jnp.sum(self.mass.astype(self._taken(state).dtype) * a) for a in state.velocity])
 
     def angular_momentum(self, state: State) -> Array:
         """About the origin [kg m^2/s]: (3,) in space, (1,) in the plane."""
-        m, x, p = self.mass.astype(state.dtype), state.position, state.velocity
+        m, x, p = self.mass.astype(self._taken(state).dtype), state.position, state.velocity
         if state.dim == 1:
             raise ValueError("Angular momentum needs 2 or 3 coordinates; these positions have 1.")
         pairs = [(0, 1)] if state.dim == 2 else [(1, 2), (2, 0), (0, 1)]
@@ -283,7 +298,7 @@ def lumped_mass(net: Topology, points: Any, density: Any, triangles: Any = None)
     if triangles is None:
         lengths = net.lengths(points)
         return net.flatten_nodes(net.incident_sum(net.split(0.5 * density * lengths)))
-    corners = np.asarray(triangles)
+    corners = as_indices("triangles", triangles)
     a, b, c = (points[corners[:, i]] for i in range(3))
     u, v = b - a, c - a
     squared = jnp.sum(u * u, axis=1) * jnp.sum(v * v, axis=1) - jnp.sum(u * v, axis=1) ** 2
@@ -294,10 +309,7 @@ def lumped_mass(net: Topology, points: Any, density: Any, triangles: Any = None)
 def _as_free(net: Topology, free: Any) -> Free:
     if free is None:
         return None
-    if not hasattr(free, "dtype"):
-        free = np.asarray(free)
-    if free.dtype != np.bool_:
-        raise TypeError(f"free has dtype {free.dtype}; expected booleans: True moves, False is held. Node numbers are not accepted.")
+    free = as_mask("free", free, ": True moves, False is held")
     if len(shape_of(free)) == 2 and free.shape != net.node_shape:
         has_shape("free", free, {"per node": (net.n_nodes,), "per node and coordinate": (net.n_nodes, min(free.shape[1], 3))})
         return tuple(net.node_field(free[:, i], "free") for i in range(free.shape[1]))

@@ -14,9 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Inexact
 
+from ._arrays import kept, own
 from ._checks import shape_of
 
 Operand = Any  # a Vector, an array broadcast against every coordinate, or a number
+
+
+def _kept(components: Any) -> Any:
+    return tuple(kept(a) for a in components) if isinstance(components, tuple | list) else components
 
 
 class Vector(eqx.Module):
@@ -25,7 +30,7 @@ class Vector(eqx.Module):
     Arithmetic is elementwise: with another `Vector` coordinate by coordinate, with an array or a number on every coordinate.
 
     Attributes:
-        components: tuple of D arrays of one shape (the topology's node shape, or a spring family's shape).
+        components: tuple of D arrays of one shape (the topology's node shape, or a spring family's shape). NumPy arrays are copied.
 
     >>> import jax.numpy as jnp
     >>> v = Vector((jnp.array([3.0, 0.0]), jnp.array([4.0, 1.0])))
@@ -33,7 +38,7 @@ class Vector(eqx.Module):
     [10.  2.]
     """
 
-    components: tuple[Inexact[Array, "*shape"], ...]
+    components: tuple[Inexact[Array, "*shape"], ...] = eqx.field(converter=_kept)
 
     # NumPy must not turn a Vector into an object array: with this, `np.ones(2) * v` calls `Vector.__rmul__`.
     __array_ufunc__ = None
@@ -135,6 +140,6 @@ def _combine(operation: Callable[[Array, Array], Array], a: Vector, b: Any) -> V
     if not (isinstance(b, (int, float, np.ndarray, np.generic)) or eqx.is_array(b)):
         return NotImplemented
     if isinstance(b, (np.ndarray, np.generic)):
-        b = jnp.asarray(b, a.dtype)
+        b = own("the operand", b, a.dtype)
     other: Any = b
     return Vector(tuple(operation(p, other) for p in a.components))

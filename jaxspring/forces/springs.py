@@ -287,14 +287,7 @@ class Springs(Force):
 
 def _edge_constant(net: Topology, name: str, value: Any) -> Any:
     """`value` as the user passed it (so that its gradient comes back in that form), as inexact arrays of a shape that fits."""
-    from .._checks import as_inexact, has_shape
-
-    if isinstance(value, EdgeField):
-        net.edge_field(value, name)
-        return value
-    value = as_inexact(name, value)
-    has_shape(name, value, {"one number": (), "one per spring": (net.n_springs,)})
-    return value
+    return net.edge_constant(value, name)
 
 
 def _check_sign(name: str, value: Any, why: str, any_sign: bool = False) -> None:

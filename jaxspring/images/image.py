@@ -20,6 +20,7 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
+from .._arrays import given, own
 from .sampling import Bilinear, Sampling
 from .surface import Surface
 
@@ -69,7 +70,7 @@ class Image(eqx.Module):
         """The same geometry and floating type with other pixels `(ny, nx)`; their values are not checked."""
         if jnp.shape(values) != jnp.shape(self.values):
             raise ValueError(f"values has shape {jnp.shape(values)}, but the image has {jnp.shape(self.values)}: pass one value per pixel.")
-        return eqx.tree_at(lambda image: image.values, self, jnp.asarray(values, self.dtype))
+        return eqx.tree_at(lambda image: image.values, self, own("values", values, self.dtype))
 
     def normalised(self) -> Image:
         """Pixels scaled to [0, 1] by their whole range; a constant image becomes 0."""
@@ -104,12 +105,14 @@ def _per_axis(name: str, value: PerAxis, dtype: jnp.dtype, must_be_positive: boo
         if not isinstance(part, Tracer) and not (np.isfinite(part) and (part > 0 or not must_be_positive)):
             wanted = "positive and finite" if must_be_positive else "finite"
             raise ValueError(f"{name} along {axis} is {part}, but must be {wanted}: every sample would be wrong. Correct {name}.")
-    return jnp.asarray(pair[0], dtype), jnp.asarray(pair[1], dtype)
+    return own(name, pair[0], dtype), own(name, pair[1], dtype)
 
 
 def _as_pixels(values: ArrayLike) -> Array:
     """Pixels as a floating array; refuse what is not one channel of finite real numbers, naming what came and what to do."""
-    array = values if isinstance(values, Tracer) else np.asarray(values)
+    array: Any = given("values", values)
+    if not isinstance(array, Tracer):
+        array = np.asarray(array)
     dtype = _floating(np.dtype(array.dtype))
     shape = tuple(array.shape)
     if len(shape) != 2:
@@ -130,7 +133,7 @@ def _as_pixels(values: ArrayLike) -> Array:
                 "Unchecked, it would spoil every sample in the four cells around it, even exactly on a good neighbour (0 * NaN is NaN).\n"
                 "Repair the pixels, or load them with fill=<number> to replace each one that is not finite."
             )
-    return jnp.asarray(array, dtype)
+    return own("values", array, dtype)
 
 
 def _floating(dtype: np.dtype[Any]) -> np.dtype[Any]:

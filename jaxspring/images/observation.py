@@ -23,6 +23,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
+from .._arrays import own
 from .image import Image
 from .smoothing import Length, smooth
 
@@ -115,7 +116,7 @@ class Combined(Observation):
         if len(observations) != len(weights) or not observations:
             raise ValueError(f"{len(observations)} observations and {len(weights)} weights: pass at least one, and one weight for each.")
         self.observations = tuple(observations)
-        self.weights = tuple(jnp.asarray(weight, jnp.result_type(float)) for weight in weights)
+        self.weights = tuple(own("weights", weight, jnp.result_type(float)) for weight in weights)
 
     def __call__(self, image: Image) -> Array:
         """The weighted sum, `(ny, nx)`."""

@@ -16,6 +16,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
+from .._arrays import own
 from .filtering import band_distance, filter_axis
 from .image import Image
 
@@ -56,7 +57,7 @@ def smooth(image: Image, sigma: Length, radius: int | None = None) -> Image:
         least = smoothing_radius(sigma, image.spacing, deviations=2.0)
         if radius < least:
             raise ValueError(f"radius = {radius} pixels is under two standard deviations, sigma = {float(sigma)}: pass radius >= {least}.")
-    sigma = jnp.asarray(sigma, image.dtype)
+    sigma = own("sigma", sigma, image.dtype)
     values = image.values
     for axis, spacing in ((1, image.spacing[0]), (0, image.spacing[1])):
         if values.shape[axis] > 1:

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._arrays import own
 from ..files import leaf_name
 from ..numerics import cast_inexact
 from ..status import Flag, Status
@@ -155,5 +156,5 @@ def _nan_last(values: np.ndarray) -> np.ndarray:
 
 def _widened(leaf: Any) -> Any:
     if isinstance(leaf, np.ndarray) and leaf.dtype.kind == "f":
-        return jnp.asarray(leaf, jnp.float64)
+        return own("parameters", leaf, jnp.float64)
     return cast_inexact(leaf, jnp.float64)

@@ -14,6 +14,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from .._arrays import own
 from ..progress import Progress, Stopwatch
 from ..status import Flag, Status
 from .checkpoint import Checkpoint, Snapshot, read_checkpoint, write_checkpoint
@@ -257,7 +258,7 @@ class _Run:
 
 def _as_array(leaf: Any) -> Any:
     """Numbers as arrays of fixed type, so that no iteration is traced twice."""
-    return jax.numpy.asarray(leaf, jax.numpy.result_type(leaf)) if eqx.is_array_like(leaf) else leaf
+    return own("carried", leaf, jax.numpy.result_type(leaf)) if eqx.is_array_like(leaf) else leaf
 
 
 def _check_numbers(n_iterations: int, resume: bool, checkpoint: Checkpoint | None) -> None:

@@ -116,8 +116,7 @@ def prepare(parameters: PyTree) -> tuple[PyTree, PyTree]:
     def convert(path: Any, leaf: Any) -> Any:
         is_number = isinstance(leaf, (int, float)) and not isinstance(leaf, bool)
         if is_number or (isinstance(leaf, (np.ndarray, np.generic, jax.Array)) and jnp.issubdtype(leaf.dtype, jnp.inexact)):
-            array = as_inexact(leaf_name(path), leaf)
-            return jnp.asarray(array, array.dtype)
+            return as_inexact(leaf_name(path), leaf)
         return leaf
 
     trained, rest = eqx.partition(jax.tree_util.tree_map_with_path(convert, parameters), eqx.is_inexact_array)

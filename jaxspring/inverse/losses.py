@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
+from .._arrays import own
 from .._checks import shape_of
 
 
@@ -17,4 +18,4 @@ def squared_distance(points: Array, target: ArrayLike) -> Array:
     """
     if shape_of(points) != shape_of(target):
         raise ValueError(f"points have shape {shape_of(points)}, target has {shape_of(target)}; expected the same.")
-    return jnp.mean(jnp.sum((points - jnp.asarray(target, points.dtype)) ** 2, axis=-1))
+    return jnp.mean(jnp.sum((points - own("target", target, points.dtype)) ** 2, axis=-1))

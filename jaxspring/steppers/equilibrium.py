@@ -102,7 +102,7 @@ def equilibrium(
     search = _Search(
         BlockJacobi() if preconditioner is None else preconditioner, ExactSolver() if adjoint is None else adjoint, tolerance, max_iter
     )
-    return _find(search, system, state)
+    return _find(search, system, state.checked())
 
 
 class _Scene(eqx.Module):

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .._arrays import as_mask, own
 from .._checks import as_inexact, finite, has_shape, is_concrete, nonnegative
 from ..forces.base import any_refused
 from ..state import State
@@ -281,7 +282,7 @@ class Radiation(ThermalBoundary):
 
 def at_time(value: Given, time: Array, like: Array) -> Array:
     """A constant, or a function of time taken now, as a node array of the dtype of `like`."""
-    now = jnp.asarray(value(time) if callable(value) else value, like.dtype)
+    now = own("what a function of time returned", value(time) if callable(value) else value, like.dtype)
     has_shape("what a function of time returned", now, {"one number": (), "node shape": like.shape})
     return jnp.broadcast_to(now, like.shape)
 
@@ -296,9 +297,7 @@ def _or_zero(power: Array | None, like: Array) -> Array:
 
 
 def _mask(net: Topology, nodes: Any) -> Array:
-    nodes = nodes if hasattr(nodes, "dtype") else np.asarray(nodes)
-    if nodes.dtype != np.bool_:
-        raise TypeError(f"nodes has dtype {nodes.dtype}; expected booleans, one per node. Node numbers are not accepted.")
+    nodes = as_mask("nodes", nodes, ", one per node")
     has_shape("nodes", nodes, {"one per node": (net.n_nodes,), "node shape": net.node_shape})
     return net.node_field(nodes, "nodes")
 

@@ -289,13 +289,11 @@ def _temperature(state: State) -> Array:
 def _conductance(net: Topology, value: Any) -> Any:
     """The conductance as the user passed it, so that its gradient comes back in that form."""
     why = "Heat would flow from cold to hot."
+    value = net.edge_constant(value, "conductance")
     if isinstance(value, EdgeField):
-        net.edge_field(value, "conductance")
         for i, entry in enumerate(value.families):
             nonnegative(f"conductance.families[{i}]", entry, why)
         return value
-    value = as_inexact("conductance", value)
-    has_shape("conductance", value, {"one number": (), "one per spring": (net.n_springs,)})
     nonnegative("conductance", value, why)
     return value
 

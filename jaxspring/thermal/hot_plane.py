@@ -68,7 +68,7 @@ class HotPlane(ThermalBoundary):
         self.reach = as_inexact("reach", reach)
         self.fade = as_inexact("fade", fade)
         if not callable(temperature):
-            finite("temperature", temperature)
+            finite("temperature", self.temperature)
         finite("reach", self.reach)
         for name, value in (("coefficient", self.coefficient), ("area", self.area), ("fade", self.fade)):
             nonnegative(name, value, "Heat would flow from cold to hot." if name != "fade" else "A length cannot be negative.")

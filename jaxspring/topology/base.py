@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import abc
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .._arrays import own
 from .._checks import as_inexact, finite, has_shape, shape_of
 from ..vector import Vector
 from .edge_field import EdgeField
@@ -93,9 +94,17 @@ class Topology(eqx.Module):
     def split(self, flat: Array) -> EdgeField:
         """(E,) array in the user's order -> edge field."""
 
+    def flatten(self, field: Any) -> Array:
+        """Edge field -> (E,) array in the user's order. One number is repeated; what is (E,) already comes back as it is."""
+        if isinstance(field, EdgeField):
+            return self._flatten(self._spread(field))
+        flat = own("field", field)
+        has_shape("field", flat, {"one number": (), "one per spring": (self.n_springs,)})
+        return jnp.broadcast_to(flat, (self.n_springs,))
+
     @abc.abstractmethod
-    def flatten(self, field: EdgeField) -> Array:
-        """Edge field -> (E,) array in the user's order."""
+    def _flatten(self, field: EdgeField) -> Array:
+        """Edge field in full shape -> (E,) array in the user's order."""
 
     @abc.abstractmethod
     def unboxed(self) -> Topology:
@@ -136,22 +145,52 @@ class Topology(eqx.Module):
         return EdgeField(tuple(law(*entries) for entries in zip(*columns, strict=True)))
 
     def edge_field(self, value: Any, name: str = "value") -> Array | EdgeField:
-        """A number, an (E,) array in the user's order, or an edge field, in the shape of the topology.
+        """A number, an (E,) array in the user's order, an edge field, or on a lattice numbers by family, in the shape of the topology.
 
-        A number stays a 0-d array. Raises ValueError where the shape fits neither.
+        Numbers by family are a mapping such as `{js.STRUCTURAL: 100.0, js.SHEAR: 50.0}`, which names every family of the lattice, or an
+        edge field with one number for each. One number for all stays a 0-d array. Raises ValueError where the shape fits neither.
         """
         if isinstance(value, EdgeField):
-            shapes = tuple(shape_of(entry) for entry in value.families)
-            if shapes != self.family_shapes:
-                raise ValueError(f"{name} is an edge field of shapes {shapes}; this topology has {self.family_shapes}.")
-            return value
+            self._check_families(name, value)
+            return self._spread(value)
+        value = self.edge_constant(value, name)
+        if isinstance(value, EdgeField):
+            return self._spread(value)
+        return self.split(value) if value.ndim else value
+
+    def edge_constant(self, value: Any, name: str = "value") -> Array | EdgeField:
+        """What `edge_field` takes, checked and as floating arrays, but in the form it was passed: its gradient comes back in that form.
+
+        Numbers by family become an edge field with one number for each family.
+        """
+        if isinstance(value, Mapping):
+            value = EdgeField(self._by_family(value, name))
+        if isinstance(value, EdgeField):
+            self._check_families(name, value)
+            return EdgeField(tuple(as_inexact(f"{name}.families[{i}]", entry) for i, entry in enumerate(value.families)))
         value = as_inexact(name, value)
         has_shape(name, value, {"one number": (), "one per spring": (self.n_springs,)})
-        return self.split(value) if value.ndim else value
+        return value
+
+    def _by_family(self, value: Mapping[Any, Any], name: str) -> tuple[Any, ...]:
+        """One number for each family, from a mapping that names them."""
+        raise TypeError(f"{name} is a mapping, but a {type(self).__name__} has no families by name. Pass a number, or (E,) values.")
+
+    def _check_families(self, name: str, field: EdgeField) -> None:
+        shapes = tuple(shape_of(entry) for entry in field.families)
+        fits = len(shapes) == len(self.family_shapes)
+        if not (fits and all(shape in ((), full) for shape, full in zip(shapes, self.family_shapes, strict=True))):
+            raise ValueError(f"{name} is an edge field of shapes {shapes}; this topology has {self.family_shapes}.")
+
+    def _spread(self, field: EdgeField) -> EdgeField:
+        """The field with the numbers of whole families in full shape."""
+        if all(shape_of(entry) for entry in field.families):
+            return field
+        return EdgeField(tuple(jnp.broadcast_to(a, shape) for a, shape in zip(field.families, self.family_shapes, strict=True)))
 
     def node_field(self, value: Any, name: str = "value") -> Array:
         """A number, an (N,) array in the user's order, or an array in node shape, as a node array (a number stays 0-d)."""
-        value = jnp.asarray(value)
+        value = own(name, value)
         allowed = {"one number": (), "one per node": (self.n_nodes,), "node shape": self.node_shape}
         has_shape(name, value, allowed)
         if value.ndim == 0 or (value.shape == self.node_shape and self.node_permutation is None):

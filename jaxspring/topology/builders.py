@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from .._arrays import given
 from .._checks import finite
 from .graph import Graph
 from .reduction import Gather, Scatter
@@ -130,24 +131,30 @@ def from_scipy(matrix: Any, *, reduction: Reductions = None) -> tuple[Graph, np.
     """A network from a symmetric adjacency matrix: one spring per stored pair i < j.
 
     Args:
-        matrix: (N, N) sparse or dense, symmetric, with an empty diagonal; an entry is a weight, e.g. a stiffness [N/m].
+        matrix: (N, N) sparse or dense, symmetric, with an empty diagonal; an entry is a weight, e.g. a stiffness [N/m]. In a sparse matrix
+            a zero that is stored is a spring of weight zero, on whichever side of the diagonal it is; entries stored twice are summed.
         reduction: see `Graph.from_edges`.
 
     Returns:
-        `(net, weights)`: a `Graph` and the (E,) weight of each spring, in the order of `net.edges`.
+        `(net, weights)`: a `Graph` and the (E,) weight of each spring in float64, in the order of `net.edges`.
 
     Raises:
-        ValueError: a matrix that is not square or not symmetric, or an entry on its diagonal.
+        ValueError: a matrix that is not square or not symmetric, an entry on its diagonal, or one that is not finite.
+        TypeError: entries that are not real numbers.
 
     >>> net, weights = from_scipy(np.array([[0, 2.0, 0], [2.0, 0, 5.0], [0, 5.0, 0]]))
     >>> net.edges.tolist(), weights.tolist()
     ([[0, 1], [1, 2]], [2.0, 5.0])
     """
-    from scipy.sparse import coo_array
+    from scipy.sparse import coo_array, issparse
 
-    matrix = coo_array(matrix)
+    matrix = coo_array(matrix if issparse(matrix) else np.asarray(given("matrix", matrix)))
+    if matrix.dtype.kind not in "biuf":
+        raise TypeError(f"matrix has dtype {matrix.dtype}; expected real numbers.")
+    matrix = matrix.astype(np.float64)  # before what is stored twice is summed: small types wrap round
     if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
         raise ValueError(f"matrix has shape {matrix.shape}; expected (N, N), one row and one column per node.")
+    finite("the entries of matrix", matrix.data)
     matrix = matrix.tocsr()  # sums what is stored twice
     unequal = (matrix - matrix.T).tocoo()
     wrong = np.flatnonzero(unequal.data)
@@ -160,10 +167,12 @@ def from_scipy(matrix: Any, *, reduction: Reductions = None) -> tuple[Graph, np.
     loops = np.flatnonzero(matrix.diagonal())
     if len(loops):
         raise ValueError(f"matrix[{loops[0]}, {loops[0]}] joins node {loops[0]} to itself. Set the diagonal to zero.")
-    upper = matrix.tocoo()
-    keep = upper.row < upper.col
-    edges = np.stack([upper.row[keep], upper.col[keep]], axis=-1).astype(np.int64)
-    return Graph.from_edges(edges, matrix.shape[0], reduction=reduction), upper.data[keep]
+    stored = matrix.tocoo()
+    both = np.stack([np.minimum(stored.row, stored.col), np.maximum(stored.row, stored.col)], axis=-1).astype(np.int64)
+    keep = both[:, 0] < both[:, 1]
+    # Where both sides are stored they are equal: the first will do.
+    edges, first = np.unique(both[keep], axis=0, return_index=True)
+    return Graph.from_edges(edges, matrix.shape[0], reduction=reduction), stored.data[keep][first]
 
 
 def from_networkx(
@@ -173,7 +182,7 @@ def from_networkx(
 
     Args:
         graph: `networkx.Graph` or `MultiGraph`.
-        attributes: names of edge attributes to read, e.g. `("stiffness", "rest_length")`.
+        attributes: names of edge attributes to read, e.g. `("stiffness", "rest_length")`; a single name is one attribute.
         reduction: see `Graph.from_edges`.
 
     Returns:
@@ -181,8 +190,8 @@ def from_networkx(
         in the order of `net.edges`.
 
     Raises:
-        TypeError: a directed graph.
-        ValueError: an edge that lacks an attribute, or joins a node to itself.
+        TypeError: a directed graph, or what is no graph; an attribute that is not a number.
+        ValueError: an edge that lacks an attribute, has one that is not finite, or joins a node to itself.
 
     >>> import networkx
     >>> graph = networkx.Graph()
@@ -191,19 +200,33 @@ def from_networkx(
     >>> net.n_springs, labels, stiffness.tolist()
     (1, ['a', 'b'], [3.0])
     """
+    if not hasattr(graph, "is_directed"):
+        raise TypeError(f"graph is a {type(graph).__name__}; expected a networkx.Graph.")
     if graph.is_directed():
         raise TypeError("graph is directed, but a spring pulls both its ends alike. Pass graph.to_undirected().")
     labels = list(graph.nodes)
     number = {label: i for i, label in enumerate(labels)}
     edges = list(graph.edges(data=True))
     values = []
-    for name in attributes:
-        for tail, head, data in edges:
-            if name not in data:
-                raise ValueError(f"edge ({tail!r}, {head!r}) has no attribute {name!r}; it has {sorted(data)}.")
-        values.append(np.array([data[name] for _, _, data in edges], float))
+    for name in (attributes,) if isinstance(attributes, str) else tuple(attributes):
+        values.append(np.array([_attribute(name, *edge) for edge in edges], float))
     pairs = [(number[tail], number[head]) for tail, head, _ in edges]
     return Graph.from_edges(pairs, len(labels), reduction=reduction), labels, tuple(values)
+
+
+def _attribute(name: str, tail: Hashable, head: Hashable, data: dict[Any, Any]) -> float:
+    """One attribute of an edge, which must be a finite number."""
+    where = f"edge ({tail!r}, {head!r})"
+    if name not in data:
+        raise ValueError(f"{where} has no attribute {name!r}; it has {', '.join(map(repr, data)) or 'none'}.")
+    value = data[name]
+    if isinstance(value, bool | str | bytes) or value is None:
+        raise TypeError(f"{where} has {name} = {value!r}; expected a number.")
+    array = np.asarray(given(f"{name} of {where}", value))
+    if array.ndim or array.dtype.kind not in "iuf":
+        raise TypeError(f"{where} has {name} = {value!r:.60}; expected one real number.")
+    finite(f"{name} of {where}", array)
+    return float(array)
 
 
 def _sides(simplices: np.ndarray) -> np.ndarray:

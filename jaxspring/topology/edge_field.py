@@ -10,20 +10,26 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._arrays import kept, own
 from .._checks import shape_of
+
+
+def _kept(families: Any) -> Any:
+    return tuple(kept(entry) for entry in families) if isinstance(families, tuple | list) else families
 
 
 class EdgeField(eqx.Module):
     """A value (an array, or a `Vector` of arrays) on every spring.
 
     On a lattice there is one entry per spring family, in the shape of that family's tails; on a graph a single entry of shape (E,).
+    As a constant of springs an entry may also be one number for its whole family.
     Arithmetic is elementwise with another field or with a number.
 
     Attributes:
-        families: tuple with one entry per spring family.
+        families: tuple with one entry per spring family. NumPy arrays are copied.
     """
 
-    families: tuple[Any, ...]
+    families: tuple[Any, ...] = eqx.field(converter=_kept)
 
     __array_ufunc__ = None
 
@@ -76,7 +82,7 @@ class EdgeField(eqx.Module):
                 f"An EdgeField was combined with an array of shape {shape_of(other)}. Convert it first: network.edge_field(array)."
             )
         if isinstance(other, (np.ndarray, np.generic)):
-            other = jnp.asarray(other, jax.tree.leaves(self.families)[0].dtype)
+            other = own("the operand", other, jax.tree.leaves(self.families)[0].dtype)
         return self.map(lambda entry: operation(entry, other))
 
 

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
+from .._arrays import as_indices, whole_number
 from .._checks import node_indices
 from ..vector import Vector
 from .base import Topology
@@ -51,7 +52,7 @@ class Graph(Topology):
         """A network from an (E, 2) integer array: tail and head node of each spring. Springs may be repeated.
 
         Args:
-            edges: (E, 2) node numbers.
+            edges: (E, 2) node numbers: an array, or any series of pairs. Numbers: inside jit, grad and vmap a net cannot be built.
             n_nodes: number of nodes N; a node without a spring is allowed.
             box: (D,) period of each coordinate [m]; zero where a coordinate is not periodic.
             triangles: (T, 3) triangles, kept for plots and surfaces.
@@ -60,12 +61,13 @@ class Graph(Topology):
 
         Raises:
             ValueError: no node, a node that does not exist, a spring that joins a node to itself.
-            TypeError: node numbers that are not integers.
+            TypeError: node numbers that are not integers, or are traced.
 
         >>> net = Graph.from_edges([(0, 1), (1, 2)], n_nodes=3)
         >>> net.n_springs
         2
         """
+        n_nodes = whole_number("n_nodes", n_nodes)
         if n_nodes < 1:
             raise ValueError(f"n_nodes = {n_nodes}, but a network needs at least 1 node.")
         pairs = node_indices("edges", edges, n_nodes)
@@ -81,8 +83,8 @@ class Graph(Topology):
             heads=jnp.asarray(heads),
             reduction=sums,
             box=_as_box(box),
-            triangles=None if triangles is None else np.asarray(triangles, np.int32),
-            count=int(n_nodes),
+            triangles=None if triangles is None else _as_triangles(triangles),
+            count=n_nodes,
             nodes=nodes,
             springs=springs,
         )
@@ -142,12 +144,19 @@ class Graph(Topology):
         """(E,) array in the user's order -> edge field."""
         return EdgeField((self.springs.inward(flat),))
 
-    def flatten(self, field: EdgeField) -> Array:
+    def _flatten(self, field: EdgeField) -> Array:
         """Edge field -> (E,) array in the user's order."""
         return self.springs.outward(field.families[0])
 
     def _per_array(self, function: Callable[[Array, Array, Array], Array], v: Vector) -> Vector:
         return v.map(lambda a: function(a, self.tails, self.heads))
+
+
+def _as_triangles(triangles: Any) -> np.ndarray:
+    """Triangles of the net's own, which nobody can change."""
+    own = as_indices("triangles", triangles).astype(np.int32)
+    own.setflags(write=False)
+    return own
 
 
 def _locality_order(pairs: np.ndarray, n_nodes: int) -> np.ndarray:

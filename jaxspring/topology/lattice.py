@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -19,6 +19,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from .._arrays import whole_number
 from .._checks import as_inexact
 from ..numerics import linear_call
 from ..vector import Vector
@@ -170,11 +171,28 @@ class Lattice(Topology):
             start += size
         return EdgeField(tuple(families))
 
-    def flatten(self, field: EdgeField) -> Array:
+    def _flatten(self, field: EdgeField) -> Array:
         """Edge field -> (E,) array."""
         entries = zip(field.families, self.offsets, strict=True)
         flat = [jnp.ravel(shifts.crop(self.grid_shape, entry, offset)) for entry, offset in entries]
         return jnp.concatenate(flat) if flat else jnp.zeros((0,))
+
+    def _by_family(self, value: Mapping[Any, Any], name: str) -> tuple[Any, ...]:
+        """One number for each offset, from a mapping whose keys are STRUCTURAL, SHEAR, ... or sums of them."""
+        found: dict[Offset, Any] = {}
+        for springs, number in value.items():
+            if not isinstance(springs, SpringFamilies):
+                raise TypeError(f"{name} has the key {springs!r:.60}; expected families of springs, e.g. {{STRUCTURAL: 100.0, SHEAR: 50.0}}.")
+            offsets = springs.offsets(len(self.shape))
+            if not set(offsets) & set(self.offsets):
+                raise ValueError(f"{name} names {springs}, but this lattice has no such springs. Leave {springs} out.")
+            if not set(offsets).isdisjoint(found):
+                raise ValueError(f"{name} names the springs of {springs} twice. Name each family once.")
+            found.update(dict.fromkeys(offsets, number))
+        missing = [offset for offset in self.offsets if offset not in found]
+        if missing:
+            raise ValueError(f"{name} says nothing of the springs along {missing[0]} (index offset). Name every family of the lattice.")
+        return tuple(found[offset] for offset in self.offsets)
 
     def inside(self, field: EdgeField, fill: float) -> EdgeField:
         """The field with `fill` where a family's margin holds no spring."""
@@ -209,7 +227,8 @@ def lattice(
     >>> net.n_nodes, net.n_springs
     (12, 29)
     """
-    shape = (int(shape),) if isinstance(shape, (int, np.integer)) else tuple(int(n) for n in shape)
+    given = tuple(shape) if isinstance(shape, Iterable) and getattr(shape, "ndim", 1) else (shape,)
+    shape = tuple(whole_number("shape", n) for n in given)
     if not 1 <= len(shape) <= 3:
         raise ValueError(f"shape = {shape} has {len(shape)} axes; expected 1 (chain), 2 (sheet) or 3 (block).")
     if min(shape) < 1:

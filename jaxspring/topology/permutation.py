@@ -29,7 +29,7 @@ class Permutation:
         return self is other or (isinstance(other, Permutation) and self._digest == other._digest)
 
     def __repr__(self) -> str:
-        return f"Permutation(size={self.order.size})"
+        return f"Permutation(size={self.order.size}, numbering={self._digest[:6]})"
 
     def inward(self, a: Array) -> Array:
         """User's order -> internal order, along the last axis."""

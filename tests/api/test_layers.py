@@ -9,6 +9,7 @@ from tests import source
 # One layer per module or package right under jaxspring/. A module may import its own layer and those below.
 LAYERS = {
     "_version": 0,
+    "_arrays": 0,
     "_checks": 0,
     "numerics": 0,
     "status": 0,

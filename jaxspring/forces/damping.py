@@ -23,6 +23,7 @@ from ..topology.base import Topology
 from ..topology.edge_field import EdgeField
 from ..vector import Vector
 from .base import Force, any_refused
+from .living import counted, living, map_living
 from .springs import _check_sign, _edge_constant
 
 
@@ -78,6 +79,8 @@ class Drag(Force):
 class Dashpots(Force):
     """A damper along every spring of a network.
 
+    A spring that is broken in `state.alive` has no damper.
+
     Attributes:
         net: the topology.
         damping: c [N s/m]: a number, (E,) in the user's order, or an `EdgeField`.
@@ -105,7 +108,7 @@ class Dashpots(Force):
             return (c * (d.dot(relative) * inverse) * inverse) * d
 
         d = self.net.difference(state.position)
-        pulls = self.net.map_springs(pull, d, self._rate(state), self.net.edge_field(self.damping))
+        pulls = map_living(self.net, state, pull, d, self._rate(state), self.net.edge_field(self.damping))
         return self.net.accumulate(pulls)
 
     def damping_blocks(self, state: State) -> Blocks | None:
@@ -113,8 +116,9 @@ class Dashpots(Force):
         if self.net.n_springs == 0:
             return None
         d = self.net.difference(state.position)
-        slope = self.net.map_springs(lambda d, c: jnp.broadcast_to(c, d.shape).astype(d.dtype), d, self.net.edge_field(self.damping))
-        direction = d.map(lambda d: _inverse_length(d) * d)
+        c = self.net.edge_field(self.damping)
+        slope = map_living(self.net, state, lambda d, c: jnp.broadcast_to(c, d.shape).astype(d.dtype), d, c)
+        direction = map_living(self.net, state, lambda d: _inverse_length(d) * d, d)
         return Blocks(springs=(SpringBlocks(self.net, slope * 0, slope, direction),))
 
     def can_feed(self, state: State) -> bool:
@@ -122,12 +126,15 @@ class Dashpots(Force):
         return False
 
     def damping_bound(self, state: State) -> Array | None:
-        """Twice the sum of the dampers at each node [N s/m]."""
+        """Twice the sum of the dampers at each node [N s/m], those of broken springs too: they may come back."""
         if self.net.n_springs == 0:
             return None
         c = self.net.edge_field(self.damping)
-        spread = EdgeField(tuple(jnp.ones(shape, state.dtype) for shape in self.net.family_shapes))
-        return 2 * self.net.incident_sum(self.net.map_springs(lambda one, c: one * c, spread, c))
+        spread = self.net.own(jnp.ones(shape, state.dtype) for shape in self.net.family_shapes)
+        spread = self.net.map_springs(lambda one, c: one * c, spread, c)
+        alive = living(self.net, state)
+        spread = spread if alive is None else self.net.map_springs(counted, spread, spread, alive)
+        return 2 * self.net.incident_sum(spread)
 
     def invalid(self) -> Array:
         """Whether a damper is negative or not finite."""

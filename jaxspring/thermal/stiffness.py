@@ -21,6 +21,7 @@ from jaxtyping import Array
 
 from .._checks import as_inexact, finite, has_shape, is_concrete, nonnegative, positive
 from ..forces.base import any_refused
+from ..forces.living import map_living
 from ..forces.springs import ExpansionRule, StiffnessRule
 from ..numerics import cast_inexact
 from ..state import State
@@ -78,7 +79,7 @@ class ThermalStiffness(StiffnessRule):
         warm = net.average(temperature_of(state, "ThermalStiffness"))
         full, low, high = cast_inexact((net.edge_field(self.full, "stiffness"), self.softening, self.melting), state.dtype)
         b = None if self.sharpness is None else self.sharpness.astype(state.dtype)
-        return net.map_springs(lambda full, theta: full * _share((high - theta) / (high - low), b), full, warm)
+        return map_living(net, state, lambda full, theta: full * _share((high - theta) / (high - low), b), full, warm)
 
     def upper_bound(self) -> Any:
         """The largest of the full stiffnesses [N/m]."""

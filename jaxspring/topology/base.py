@@ -9,10 +9,11 @@
 from __future__ import annotations
 
 import abc
+import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -22,6 +23,7 @@ from jaxtyping import Array
 from .._checks import as_inexact, finite, has_shape, shape_of
 from ..vector import Vector
 from .edge_field import EdgeField
+from .identity import NetIdentity
 from .permutation import Permutation
 
 
@@ -62,6 +64,11 @@ class Topology(eqx.Module):
 
     @property
     @abc.abstractmethod
+    def identity(self) -> NetIdentity:
+        """What tells these springs from those of another net. Known from what is static, so that a traced net has it too."""
+
+    @property
+    @abc.abstractmethod
     def node_permutation(self) -> Permutation | None:
         """From the user's node order to the internal one, or None where the two agree."""
 
@@ -96,6 +103,26 @@ class Topology(eqx.Module):
     @abc.abstractmethod
     def flatten(self, field: EdgeField) -> Array:
         """Edge field -> (E,) array in the user's order."""
+
+    def named(self, name: str | None) -> Self:
+        """The same net under a name: a set of springs of its own, with its own broken springs, though another net has the same edges.
+
+        >>> import jaxspring as js
+        >>> net = js.lattice(3)
+        >>> net.named("stiff").identity == net.identity
+        False
+        """
+        return dataclasses.replace(self, name=name)
+
+    def owns(self, field: EdgeField) -> bool:
+        """Whether an edge field tells about the springs of this net. One made by hand does not say, and is taken by its shapes."""
+        if field.identity is not None:
+            return field.identity == self.identity
+        return tuple(shape_of(entry) for entry in field.families) == self.family_shapes
+
+    def own(self, families: Iterable[Any]) -> EdgeField:
+        """An edge field of this net from an entry for each spring family."""
+        return EdgeField(tuple(families), self.identity)
 
     @abc.abstractmethod
     def unboxed(self) -> Topology:
@@ -133,7 +160,7 @@ class Topology(eqx.Module):
         """Call `law` once per spring family; a number or 0-d array is passed to every family as it is."""
         count = len(self.family_shapes)
         columns = [f.families if isinstance(f, EdgeField) else (f,) * count for f in fields]
-        return EdgeField(tuple(law(*entries) for entries in zip(*columns, strict=True)))
+        return self.own(law(*entries) for entries in zip(*columns, strict=True))
 
     def edge_field(self, value: Any, name: str = "value") -> Array | EdgeField:
         """A number, an (E,) array in the user's order, or an edge field, in the shape of the topology.
@@ -144,7 +171,12 @@ class Topology(eqx.Module):
             shapes = tuple(shape_of(entry) for entry in value.families)
             if shapes != self.family_shapes:
                 raise ValueError(f"{name} is an edge field of shapes {shapes}; this topology has {self.family_shapes}.")
-            return value
+            if value.identity is not None and not value.identity.has_springs_of(self.identity):
+                raise ValueError(
+                    f"{name} is an edge field of another net with fields of the same shapes ({value.identity}; here {self.identity}): its "
+                    f"values would go to other springs. Make it with this net, e.g. net.edge_field(array)."
+                )
+            return dataclasses.replace(value, identity=self.identity)
         value = as_inexact(name, value)
         has_shape(name, value, {"one number": (), "one per spring": (self.n_springs,)})
         return self.split(value) if value.ndim else value

@@ -19,10 +19,12 @@ from .._checks import as_inexact, nonnegative
 from ..linalg.operators import Blocks, SpringBlocks, isotropic
 from ..numerics import cast_inexact, tiny
 from ..state import State
+from ..status import Flag
 from ..topology.base import Topology
 from ..topology.edge_field import EdgeField
 from ..vector import Vector
-from .base import Force, any_refused
+from .base import Finding, Force, any_refused
+from .laws import has_no_direction, is_beyond_range
 from .living import counted, living, map_living
 from .springs import _check_sign, _edge_constant
 
@@ -120,6 +122,24 @@ class Dashpots(Force):
         slope = map_living(self.net, state, lambda d, c: jnp.broadcast_to(c, d.shape).astype(d.dtype), d, c)
         direction = map_living(self.net, state, lambda d: _inverse_length(d) * d, d)
         return Blocks(springs=(SpringBlocks(self.net, slope * 0, slope, direction),))
+
+    def diagnose(self, state: State) -> tuple[Finding, ...]:
+        """COINCIDENT: dampers whose ends are apart, but so near that the square of their distance underflows: they have no direction
+        then. NONFINITE: dampers so long that it overflows.
+        """
+        if self.net.n_springs == 0:
+            return ()
+
+        def near(d: Vector) -> Array:
+            is_apart = jnp.max(jnp.abs(jnp.stack(tuple(d))), axis=0) > 0
+            return (has_no_direction(d) & is_apart).astype(jnp.int32)
+
+        def far(d: Vector) -> Array:
+            return is_beyond_range(d).astype(jnp.int32)
+
+        d, nowhere = self.net.difference(state.position), jnp.asarray(-1, jnp.int32)
+        counts = (self.net.sum(map_living(self.net, state, of_family, d)) for of_family in (near, far))
+        return tuple(Finding(flag, n, nowhere) for flag, n in zip((Flag.COINCIDENT, Flag.NONFINITE), counts, strict=True))
 
     def can_feed(self, state: State) -> bool:
         """No: a damper takes energy out."""

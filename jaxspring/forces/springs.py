@@ -25,7 +25,7 @@ from ..topology.base import Topology
 from ..topology.edge_field import EdgeField, ZeroOutside
 from ..vector import Vector
 from .base import Finding, Force, any_refused
-from .laws import Hooke, Law, PowerLaw, spring_block, spring_energy, spring_pull
+from .laws import Hooke, Law, PowerLaw, TensionOnly, has_no_direction, is_beyond_range, length_of, spring_block, spring_energy, spring_pull
 from .linearisation import Linearisation
 from .living import counted, heeding, living, map_living
 
@@ -172,7 +172,8 @@ class Springs(Force):
         """Pull of each spring along itself [N]: positive stretched, negative squeezed, zero broken. `net.flatten` gives (E,)."""
 
         def of_family(d: Vector, k: Array, l: Array) -> Array:
-            return self.law.weight(d.dot(d), k, l) * d.norm()
+            squared = d.dot(d)
+            return self.law.weight(squared, k, l) * length_of(squared)
 
         return self._each(state, of_family)
 
@@ -189,17 +190,27 @@ class Springs(Force):
         return 2 * self.net.incident_sum(k)
 
     def diagnose(self, state: State) -> tuple[Finding, ...]:
-        """COINCIDENT: springs with a rest length whose ends are at one place."""
-        given = state.rest_length is None and is_concrete(self.rest_length)
+        """COINCIDENT: springs whose ends are at one place, or so near that the square of their distance underflows, where they have a rest
+        length; under a law of one's own also without, unless they are at one place exactly. NONFINITE: springs so long that it overflows.
+        """
+        is_linear = isinstance(self.law, Hooke | TensionOnly)
+        given = state.rest_length is None and is_concrete(self.rest_length) and is_linear
         if self.net.n_springs == 0 or (given and not jnp.any(self.rest_length > 0)):
+            # A pull k d takes no square.
             return ()
 
-        def degenerate(d: Vector, _: Array, l: Array) -> Array:
-            squared = d.dot(d)
-            return ((squared <= tiny(squared.dtype)) & (l > 0)).astype(jnp.int32)
+        def coincident(d: Vector, _: Array, l: Array) -> Array:
+            needs_direction = l > 0
+            if not is_linear:
+                needs_direction = needs_direction | (jnp.max(jnp.abs(jnp.stack(tuple(d))), axis=0) > 0)
+            return (has_no_direction(d) & needs_direction).astype(jnp.int32)
 
-        count = self.net.sum(self._each(state, degenerate))
-        return (Finding(Flag.COINCIDENT, count, jnp.asarray(-1, jnp.int32)),)
+        def beyond(d: Vector, _: Array, l: Array) -> Array:
+            return is_beyond_range(d).astype(jnp.int32)
+
+        nowhere = jnp.asarray(-1, jnp.int32)
+        counts = (self.net.sum(self._each(state, of_family)) for of_family in (coincident, beyond))
+        return tuple(Finding(flag, n, nowhere) for flag, n in zip((Flag.COINCIDENT, Flag.NONFINITE), counts, strict=True))
 
     def invalid(self) -> Array | None:
         """Whether a constant is negative or not finite."""

@@ -145,7 +145,7 @@ def minimal_rollout(x, y, vx, vy, k, l, m, dt):
 # What looking for trouble takes: is it finite, where, what each effect reports, whether the constants are ones a constructor would take,
 # and the replay of a failed run.
 OF_STATUSES = {"is_finite", "not", "or", "and", "reduce", "select", "compare", "maximum", "minimum", "abs", "concatenate", "sqrt", "iota"}
-OF_STATUSES |= {"case", "while", "add", "subtract", "multiply", "divide", "rsqrt", "pad", "slice"}
+OF_STATUSES |= {"case", "while", "add", "subtract", "multiply", "divide", "rsqrt", "pad", "slice", "reduce_precision"}
 
 
 def lowered_rollout(what):

@@ -82,9 +82,9 @@ class ThermalStiffness(StiffnessRule):
         return map_living(net, state, lambda full, theta: full * _share((high - theta) / (high - low), b), full, warm)
 
     def upper_bound(self) -> Any:
-        """The largest of the full stiffnesses [N/m]."""
+        """The largest of the full stiffnesses [N/m]. One that is not finite is left out: it is refused, or its spring is broken."""
         entries = self.full.families if isinstance(self.full, EdgeField) else (self.full,)
-        return jnp.max(jnp.stack([jnp.max(entry) for entry in entries]))
+        return jnp.max(jnp.stack([jnp.max(jnp.where(jnp.isfinite(entry), entry, jnp.zeros_like(entry))) for entry in entries]))
 
     def invalid(self) -> Array:
         """Whether a constant is one that the constructor refuses."""

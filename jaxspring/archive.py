@@ -1,11 +1,12 @@
 """Named arrays in one file, written whole or not at all, and never trusted when read.
 
-The file is an uncompressed `.npz`, so `numpy.load` opens it too, with one more member, `header.json`:
+The file is an uncompressed `.npz`, so `numpy.load` opens it too, with one more array, `header.json`, of no dimension, whose `item()` is:
 
     {"format": "jaxspring", "version": 1, "about": {...}, "arrays": [{"name", "dtype", "shape", "sha256"}, ...]}
 
-and the digest of that header as the archive's comment. Nothing is pickled. Reading checks sizes before memory is taken, and digests
-before a number is used: a damaged file gives a `CheckpointError`, never a wrong number.
+and the digest of that header as the archive's comment. (Older files hold the header as it is, for which `numpy.load` gives bytes.)
+Nothing is pickled. Reading checks sizes before memory is taken, and digests before a number is used: a damaged file gives a
+`CheckpointError`, never a wrong number.
 """
 
 from __future__ import annotations
@@ -63,12 +64,14 @@ def write_archive(path: Path, arrays: Mapping[str, np.ndarray], about: Mapping[s
     with atomic_file(path) as stream, zipfile.ZipFile(stream, "w", zipfile.ZIP_STORED) as archive:
         for name, array in arrays.items():
             _check_name(name)
+            if name == HEADER:
+                raise ValueError(f"An array cannot be called {HEADER!r}, which is what the file says of itself. Rename it.")
             entries.append(_write_array(archive, name, np.asarray(array)))
         header = {"format": "jaxspring", "version": VERSION, "about": dict(about or {}), "arrays": entries}
         data = json.dumps(header, allow_nan=False).encode()
         if len(data) > LONGEST_HEADER:
             raise ValueError(f"The header would take {len(data)} bytes, more than {LONGEST_HEADER}: too many arrays for one file.")
-        archive.writestr(zipfile.ZipInfo(HEADER), data)
+        archive.writestr(zipfile.ZipInfo(f"{HEADER}.npy"), _header_head(len(data)) + data)
         archive.comment = _seal(data)
 
 
@@ -163,7 +166,7 @@ def _read(archive: zipfile.ZipFile, file_size: int) -> Archive:
     if sum(info.file_size for info in members.values()) > file_size:
         raise CheckpointError(f"its arrays claim more than the {file_size} bytes that the file has")
     header = _read_header(archive, members)
-    listed = {HEADER, *(f"{entry['name']}.npy" for entry in header["arrays"])}
+    listed = {_header_name(members), *(f"{entry['name']}.npy" for entry in header["arrays"])}
     if listed != set(members) or len(listed) != len(header["arrays"]) + 1:
         differing = ", ".join(repr(name) for name in sorted(listed ^ set(members))[:5])
         raise CheckpointError(f"the header and the archive name different arrays ({differing})")
@@ -172,11 +175,17 @@ def _read(archive: zipfile.ZipFile, file_size: int) -> Archive:
 
 
 def _read_header(archive: zipfile.ZipFile, members: Mapping[str, zipfile.ZipInfo]) -> dict[str, Any]:
-    if HEADER not in members:
+    name = _header_name(members)
+    if name not in members:
         raise CheckpointError(f"it has no {HEADER!r}, so it is not a jaxspring file")
-    if members[HEADER].file_size > LONGEST_HEADER:
-        raise CheckpointError(f"its header has {members[HEADER].file_size} bytes; expected at most {LONGEST_HEADER}")
-    data = archive.read(HEADER)
+    if members[name].file_size > LONGEST_HEADER + len(_header_head(LONGEST_HEADER)):
+        raise CheckpointError(f"its header has {members[name].file_size} bytes; expected at most {LONGEST_HEADER}")
+    data = archive.read(name)
+    if name != HEADER:
+        head = _header_head(max(len(data) - len(_header_head(1)), 1))
+        if not data.startswith(head):
+            raise CheckpointError("its header is no array of bytes, as it should be: the file is damaged")
+        data = data[len(head) :]
     header = json.loads(data)
     if header["format"] != "jaxspring":
         raise CheckpointError(f"its format is {header['format']!r}; expected 'jaxspring'")
@@ -208,6 +217,16 @@ def _read_array(archive: zipfile.ZipFile, info: zipfile.ZipInfo, entry: Mapping[
     if digest.hexdigest() != entry["sha256"] or start != head:
         raise CheckpointError(f"the digest of {name!r} does not match: the file is damaged")
     return body.view(dtype).reshape(shape, order="F" if entry["fortran"] else "C")
+
+
+def _header_name(members: Mapping[str, zipfile.ZipInfo]) -> str:
+    """As a member of its own in older files, as an array in newer ones."""
+    return HEADER if HEADER in members else f"{HEADER}.npy"
+
+
+def _header_head(n_bytes: int) -> bytes:
+    """What comes before the bytes of the header; as long for every header."""
+    return _npy_head(np.dtype(f"S{n_bytes}"), (), False)
 
 
 def _npy_head(dtype: np.dtype, shape: tuple[int, ...], is_fortran: bool) -> bytes:

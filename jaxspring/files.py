@@ -19,6 +19,7 @@ import numpy as np
 from .archive import CheckpointError, Path, read_archive, write_archive
 from .state import State
 from .topology.base import Topology
+from .topology.edge_field import EdgeField
 
 PyTree = Any
 
@@ -41,7 +42,7 @@ def save(path: Path, tree: PyTree) -> None:
     ...     print(load(folder + "/two.npz", like={"stiffness": 0.0}))
     {'stiffness': 3.0}
     """
-    write_archive(path, named_arrays(tree), {"kind": "tree", "topologies": topologies(tree)})
+    write_archive(path, named_arrays(tree), {"kind": "tree", "topologies": topologies(tree), "edge_fields": edge_fields(tree)})
 
 
 def load(path: Path, like: PyTree = None) -> PyTree:
@@ -60,6 +61,7 @@ def load(path: Path, like: PyTree = None) -> PyTree:
     if like is None:
         return archive.arrays
     expect_same(path, "topology", archive.about.get("topologies"), topologies(like))
+    expect_same_springs(path, archive.about.get("edge_fields", {}), edge_fields(like))
     return restored(path, archive.arrays, like)
 
 
@@ -126,8 +128,27 @@ def topologies(tree: PyTree) -> dict[str, Any]:
         if isinstance(leaf, Topology):
             edges = np.ascontiguousarray(leaf.edges, "<i8")
             digest = hashlib.sha256(edges.data).hexdigest()[:16] if edges.size else ""
-            found[leaf_name(path)] = {"nodes": list(leaf.node_shape), "springs": leaf.n_springs, "edges": digest}
+            called = {} if leaf.identity.name is None else {"name": leaf.identity.name}
+            found[leaf_name(path)] = {"nodes": list(leaf.node_shape), "springs": leaf.n_springs, "edges": digest, **called}
     return found
+
+
+def edge_fields(tree: PyTree) -> dict[str, str]:
+    """For every edge field in a tree that says whose springs it is about, the digest of that net, by name."""
+    leaves = jax.tree_util.tree_leaves_with_path(tree, is_leaf=lambda x: isinstance(x, EdgeField))
+    fields = {leaf_name(path): leaf for path, leaf in leaves if isinstance(leaf, EdgeField)}
+    return {name: field.identity.digest for name, field in fields.items() if field.identity is not None}
+
+
+def expect_same_springs(path: Path, found: Mapping[str, str], expected: Mapping[str, str]) -> None:
+    """CheckpointError where an edge field of the file is of another net than that of `like`; older files, and fields made by hand, do
+    not say.
+    """
+    for name in sorted(set(found) & set(expected)):
+        if found[name] != expected[name]:
+            complain(
+                path, f"its {name!r} is about the springs of net {found[name]}; expected those of {expected[name]}, the net of `like` there"
+            )
 
 
 def expect_same(path: Path, what: str, found: Any, expected: Any) -> None:

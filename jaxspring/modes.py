@@ -81,6 +81,8 @@ def normal_modes(system: System, state: State, n_modes: int | None = None) -> Mo
     """
     n = int(np.prod(state.checked().position.shape)) * state.dim
     n_free = _count_free(system, state)
+    if not n_free:
+        raise ValueError("Every coordinate is held, so that nothing moves and there are no modes. Free one, see `free` of System.")
     if n_modes is not None and not 0 < n_modes <= n_free:
         raise ValueError(f"n_modes = {n_modes}, but the system has {n_free} free coordinates; expected 1 to {n_free}.")
     if n > LARGEST_DENSE:

@@ -45,7 +45,8 @@ class Flag(enum.IntFlag):
 WARNINGS = Flag.COINCIDENT | Flag.OVERLAP | Flag.OUTSIDE | Flag.DT_LIMIT | Flag.PRECISION
 
 EXPLANATION = {
-    Flag.NONFINITE: "a position, velocity or temperature is NaN or infinite; try a smaller dt (see stable_dt), or look for a bad parameter",
+    Flag.NONFINITE: "a position, velocity or temperature is NaN or infinite, or a spring so long that its square is; try a smaller dt "
+    "(see stable_dt), or look for a bad parameter",
     Flag.ENERGY_ROSE: "an implicit step raised the energy; try a smaller dt, or Newton's step",
     Flag.CG_MAXITER: "conjugate gradients ran out of iterations; raise max_iter, loosen the tolerance or use a preconditioner",
     Flag.CG_INDEFINITE: "the matrix is not positive definite; conjugate gradients cannot be trusted on it",

@@ -7,6 +7,8 @@ Source: slide "System Dynamics" (Lagrange's equations of motion).
 
 from __future__ import annotations
 
+import copy
+import dataclasses
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -22,6 +24,7 @@ from .forces.base import Force, Rule
 from .forces.linearisation import Linearisation
 from .linalg.operators import Blocks, SpringMatrix
 from .numerics import cast_inexact
+from .pickling import refuse_local_functions
 from .state import State
 from .status import Status
 from .topology.base import Topology
@@ -105,6 +108,19 @@ class System(eqx.Module):
         self.free = _as_free(net, free)
         self.motion = motion
 
+    def __getstate__(self) -> dict[str, Any]:
+        """What pickle stores. Raises PicklingError for a lambda, naming its field."""
+        refuse_local_functions(self)
+        return dict(self.__dict__)
+
+    def __copy__(self) -> System:
+        """Another object of the same parts: a system never changes."""
+        return jax.tree.map(lambda leaf: leaf, self)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> System:
+        """The same with arrays of its own; functions are shared."""
+        return jax.tree.map(lambda leaf: copy.deepcopy(leaf, memo), self)
+
     def _cast(self, effect: Force, state: State) -> Force:
         """The effect in its system, and constants of the state's dtype: float32 in, float32 out, whatever the constants were."""
         return cast_inexact(effect.with_mass(self.mass).with_forces(self.forces), self._taken(state).dtype)
@@ -140,6 +156,16 @@ class System(eqx.Module):
             raise ValueError(f"{name} ({type(effect).__name__}) was built on another topology than the system.")
         return effect
 
+    def _owning(self, state: State) -> State:
+        """The state, whose broken springs and changed rest lengths are those of the system's net where they do not say: a field made by
+        hand would else be taken for every net with fields of its shapes.
+        """
+        if state.alive is None and state.rest_length is None:
+            return state
+        given = (state.alive, state.rest_length)
+        alive, rest_length = (self.net.own(f.families) if f is not None and self.net.owns(f) else f for f in given)
+        return dataclasses.replace(state, alive=alive, rest_length=rest_length)
+
     @property
     def parts(self) -> tuple[Rule, ...]:
         """Forces, then rules: in the order of their indices in a status."""
@@ -157,7 +183,7 @@ class System(eqx.Module):
 
     def begin(self, state: State) -> State:
         """The constrained state with the memory that forces and rules need."""
-        state = self.constrain(state)
+        state = self.constrain(self._owning(state))
         for _, rule in self.followers:
             state = rule.begin(state)
         return state
@@ -184,7 +210,7 @@ class System(eqx.Module):
 
     def force(self, state: State) -> Vector:
         """Sum of all forces on each node [N], also where it is held (there it is what the hold must balance)."""
-        total = None
+        total, state = None, self._owning(state)
         for effect in self.forces:
             f = self._cast(effect, state).force(state)
             total = f if total is None else total + f
@@ -204,14 +230,17 @@ class System(eqx.Module):
 
     def stiffness_blocks(self, state: State, linearisation: Linearisation) -> Blocks:
         """K = -dF/dx [N/m], of the forces that name it."""
+        state = self._owning(state)
         return _sum_blocks(self._cast(f, state).stiffness_blocks(state, linearisation) for f in self.forces)
 
     def damping_blocks(self, state: State) -> Blocks:
         """G = -dF/dv [N s/m], of the forces that name it."""
+        state = self._owning(state)
         return _sum_blocks(self._cast(f, state).damping_blocks(state) for f in self.forces)
 
     def incremental_potential(self, state: State, dt: Array) -> Array | None:
         """What an implicit step minimises besides the inertia [J]; None where a force has no potential."""
+        state = self._owning(state)
         parts = [self._cast(f, state).incremental_potential(state, dt) for f in self.forces]
         if any(part is None for part in parts):
             return None
@@ -250,7 +279,8 @@ class System(eqx.Module):
 
     def energy(self, state: State) -> Energy:
         """Kinetic energy and each force's potential [J]."""
-        kinetic = 0.5 * jnp.sum(self.mass.astype(self._taken(state).dtype) * state.velocity.dot(state.velocity))
+        state = self._owning(self._taken(state))
+        kinetic = 0.5 * jnp.sum(self.mass.astype(state.dtype) * state.velocity.dot(state.velocity))
         return Energy(kinetic, tuple(self._cast(f, state).energy(state) for f in self.forces))
 
     def momentum(self, state: State) -> Array:

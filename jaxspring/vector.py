@@ -6,12 +6,14 @@ arrays the formulas read like the paper's: `d.dot(d)`, `stiffness * d`. Nodes an
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Inexact
 
 from ._arrays import kept, own
@@ -87,9 +89,16 @@ class Vector(eqx.Module):
 
     def norm(self) -> Array:
         """Euclidean length, with derivative zero (not NaN) where the length is zero."""
-        squared = self.dot(self)
+        # Over a power of two near the largest coordinate, which changes no digit: squares alone leave the range of float32 beyond 1e19.
+        largest = functools.reduce(jnp.maximum, (jnp.abs(lax.stop_gradient(a)) for a in self))
+        info = jnp.finfo(largest.dtype)
+        power = lax.reduce_precision(largest, exponent_bits=info.nexp, mantissa_bits=0)
+        scale = jnp.where((power > 0) & (power < jnp.inf), power, jnp.ones_like(power))
+        scaled = self.map(lambda a: a / scale)
+        squared = scaled.dot(scaled)
         is_zero = squared == 0
-        return jnp.where(is_zero, jnp.zeros((), squared.dtype), jnp.sqrt(jnp.where(is_zero, jnp.ones((), squared.dtype), squared)))
+        one, zero = jnp.ones((), squared.dtype), jnp.zeros((), squared.dtype)
+        return scale * jnp.where(is_zero, zero, jnp.sqrt(jnp.where(is_zero, one, squared)))
 
     def __iter__(self) -> Iterator[Array]:
         return iter(self.components)

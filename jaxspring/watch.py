@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -115,6 +116,7 @@ def look(system: System, carry: Carry) -> Status:
 
 def settle(advance: Callable[[Carry], Carry], first: Carry, status: Status, system: System) -> Status:
     """The final status: a run that failed is replayed from `first` to name the step, the node and the effect."""
+    known = (status.step, status.node, status.effect)
 
     def replay(_: None) -> tuple[Array, Array, Array]:
         last, failed = lax.while_loop(
@@ -122,11 +124,12 @@ def settle(advance: Callable[[Carry], Carry], first: Carry, status: Status, syst
             lambda pair: (pair[1], advance(pair[1])),
             (first, first),
         )
-        node = jnp.argmax(jnp.ravel(_nonfinite(failed.state)))
-        return failed.step, node.astype(jnp.int32), _blame(system, last.state, failed.state)
+        bad = jnp.ravel(_nonfinite(failed.state))
+        found = (failed.step, jnp.argmax(bad).astype(jnp.int32), _blame(system, last.state, failed.state))
+        # A spring may be too long for its square in a state that is finite.
+        return jax.tree.map(partial(jnp.where, jnp.any(bad)), found, known)
 
     has_failed = status.has(Flag.NONFINITE) & (status.step > 0)
-    known = (status.step, status.node, status.effect)
     step, node, effect = lax.cond(has_failed, replay, lambda _: known, None)
     return lax.stop_gradient(Status(status.flags, step, node, effect, status.count))
 

@@ -19,10 +19,13 @@ from .._checks import as_inexact, nonnegative
 from ..linalg.operators import Blocks, SpringBlocks, isotropic
 from ..numerics import cast_inexact, tiny
 from ..state import State
+from ..status import Flag
 from ..topology.base import Topology
 from ..topology.edge_field import EdgeField
 from ..vector import Vector
-from .base import Force, any_refused
+from .base import Finding, Force, any_refused
+from .laws import has_no_direction, is_beyond_range
+from .living import counted, living, map_living
 from .springs import _check_sign, _edge_constant
 
 
@@ -78,6 +81,8 @@ class Drag(Force):
 class Dashpots(Force):
     """A damper along every spring of a network.
 
+    A spring that is broken in `state.alive` has no damper.
+
     Attributes:
         net: the topology.
         damping: c [N s/m]: a number, (E,) in the user's order, or an `EdgeField`.
@@ -105,7 +110,7 @@ class Dashpots(Force):
             return (c * (d.dot(relative) * inverse) * inverse) * d
 
         d = self.net.difference(state.position)
-        pulls = self.net.map_springs(pull, d, self._rate(state), self.net.edge_field(self.damping))
+        pulls = map_living(self.net, state, pull, d, self._rate(state), self.net.edge_field(self.damping))
         return self.net.accumulate(pulls)
 
     def damping_blocks(self, state: State) -> Blocks | None:
@@ -113,21 +118,43 @@ class Dashpots(Force):
         if self.net.n_springs == 0:
             return None
         d = self.net.difference(state.position)
-        slope = self.net.map_springs(lambda d, c: jnp.broadcast_to(c, d.shape).astype(d.dtype), d, self.net.edge_field(self.damping))
-        direction = d.map(lambda d: _inverse_length(d) * d)
+        c = self.net.edge_field(self.damping)
+        slope = map_living(self.net, state, lambda d, c: jnp.broadcast_to(c, d.shape).astype(d.dtype), d, c)
+        direction = map_living(self.net, state, lambda d: _inverse_length(d) * d, d)
         return Blocks(springs=(SpringBlocks(self.net, slope * 0, slope, direction),))
+
+    def diagnose(self, state: State) -> tuple[Finding, ...]:
+        """COINCIDENT: dampers whose ends are apart, but so near that the square of their distance underflows: they have no direction
+        then. NONFINITE: dampers so long that it overflows.
+        """
+        if self.net.n_springs == 0:
+            return ()
+
+        def near(d: Vector) -> Array:
+            is_apart = jnp.max(jnp.abs(jnp.stack(tuple(d))), axis=0) > 0
+            return (has_no_direction(d) & is_apart).astype(jnp.int32)
+
+        def far(d: Vector) -> Array:
+            return is_beyond_range(d).astype(jnp.int32)
+
+        d, nowhere = self.net.difference(state.position), jnp.asarray(-1, jnp.int32)
+        counts = (self.net.sum(map_living(self.net, state, of_family, d)) for of_family in (near, far))
+        return tuple(Finding(flag, n, nowhere) for flag, n in zip((Flag.COINCIDENT, Flag.NONFINITE), counts, strict=True))
 
     def can_feed(self, state: State) -> bool:
         """No: a damper takes energy out."""
         return False
 
     def damping_bound(self, state: State) -> Array | None:
-        """Twice the sum of the dampers at each node [N s/m]."""
+        """Twice the sum of the dampers at each node [N s/m], those of broken springs too: they may come back."""
         if self.net.n_springs == 0:
             return None
         c = self.net.edge_field(self.damping)
-        spread = EdgeField(tuple(jnp.ones(shape, state.dtype) for shape in self.net.family_shapes))
-        return 2 * self.net.incident_sum(self.net.map_springs(lambda one, c: one * c, spread, c))
+        spread = self.net.own(jnp.ones(shape, state.dtype) for shape in self.net.family_shapes)
+        spread = self.net.map_springs(lambda one, c: one * c, spread, c)
+        alive = living(self.net, state)
+        spread = spread if alive is None else self.net.map_springs(counted, spread, spread, alive)
+        return 2 * self.net.incident_sum(spread)
 
     def invalid(self) -> Array:
         """Whether a damper is negative or not finite."""

@@ -66,7 +66,7 @@ class Hooke(Law):
 
     def energy(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
         """k/2 (r - l)^2 [J]."""
-        stretch = _length(squared_length) - rest_length
+        stretch = length_of(squared_length) - rest_length
         return 0.5 * stiffness * stretch * stretch
 
 
@@ -81,7 +81,7 @@ class TensionOnly(Law):
 
     def energy(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
         """k/2 max(0, r - l)^2 [J]."""
-        stretch = jnp.maximum(_length(squared_length) - rest_length, jnp.zeros((), squared_length.dtype))
+        stretch = jnp.maximum(length_of(squared_length) - rest_length, jnp.zeros((), squared_length.dtype))
         return 0.5 * stiffness * stretch * stretch
 
 
@@ -102,13 +102,23 @@ class PowerLaw(Law):
 
     def weight(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
         """Weight k l sign(e) |e / l|^n / r [N/m]."""
-        strain = _length(squared_length) / rest_length - 1
-        return stiffness * rest_length * jnp.sign(strain) * _power(jnp.abs(strain), self.exponent) * _inverse_length(squared_length)
+        strain = length_of(squared_length) / rest_length - 1
+        # In this order no product leaves the range of float32 before the weight itself does.
+        growth = stiffness * (jnp.sign(strain) * _power(jnp.abs(strain), self.exponent))
+        return growth * (rest_length * _inverse_length(squared_length))
+
+    def slope(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
+        """Derivative of the pull, n k |e / l|^(n-1), less the weight [N/m]."""
+        weight = self.weight(squared_length, stiffness, rest_length)
+        if self.exponent == 1:
+            return stiffness - weight
+        strain = length_of(squared_length) / rest_length - 1
+        return stiffness * self.exponent * _power(jnp.abs(strain), self.exponent - 1) - weight
 
     def energy(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
         """Energy k l^2 |e / l|^(n+1) / (n+1) [J]."""
-        strain = _length(squared_length) / rest_length - 1
-        return stiffness * rest_length * rest_length * _power(jnp.abs(strain), self.exponent + 1) / (self.exponent + 1)
+        strain = length_of(squared_length) / rest_length - 1
+        return stiffness * _power(jnp.abs(strain), self.exponent + 1) * rest_length * rest_length / (self.exponent + 1)
 
 
 class EnergyLaw(Law):
@@ -124,13 +134,18 @@ class EnergyLaw(Law):
 
     def weight(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
         """Derivative of the energy by the length, over the length [N/m]."""
-        length = _length(squared_length)
-        _, pull = jax.jvp(lambda r: self.function(r, stiffness, rest_length), (length,), (jnp.ones_like(length),))
-        return pull * _inverse_length(squared_length)
+        return self._pull(length_of(squared_length), stiffness, rest_length) * _inverse_length(squared_length)
+
+    def slope(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
+        """Second derivative of the energy by the length, less the weight [N/m]."""
+        return _slope_of(self._pull, squared_length, stiffness, rest_length)
+
+    def _pull(self, length: Array, stiffness: Array, rest_length: Array) -> Array:
+        return jax.jvp(lambda r: self.function(r, stiffness, rest_length), (length,), (jnp.ones_like(length),))[1]
 
     def energy(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
         """The user's function."""
-        return self.function(_length(squared_length), stiffness, rest_length)
+        return self.function(length_of(squared_length), stiffness, rest_length)
 
 
 class PullLaw(Law):
@@ -144,7 +159,11 @@ class PullLaw(Law):
 
     def weight(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
         """The user's pull over the length [N/m]."""
-        return self.function(_length(squared_length), stiffness, rest_length) * _inverse_length(squared_length)
+        return self.function(length_of(squared_length), stiffness, rest_length) * _inverse_length(squared_length)
+
+    def slope(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
+        """Derivative of the pull by the length, less the weight [N/m]."""
+        return _slope_of(self.function, squared_length, stiffness, rest_length)
 
     def energy(self, squared_length: Array, stiffness: Array, rest_length: Array) -> None:
         """A pull alone names no energy."""
@@ -265,12 +284,31 @@ def _spring_energy_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
     return energy, total
 
 
+def has_no_direction(d: Vector) -> Array:
+    """Where a difference is so short that its square counts as zero."""
+    squared = d.dot(d)
+    return squared <= tiny(squared.dtype)
+
+
+def is_beyond_range(d: Vector) -> Array:
+    """Where the square of a length overflows: from about 1.8e19 m on in float32. What a law then makes of it is no number to trust."""
+    return jnp.isinf(d.dot(d))
+
+
 def _inverse_length(squared: Array) -> Array:
     return lax.rsqrt(jnp.maximum(squared, tiny(squared.dtype)))
 
 
-def _length(squared: Array) -> Array:
+def length_of(squared: Array) -> Array:
+    """The root of a squared length, with derivative zero where there is none; NaN where the square has overflowed."""
     return squared * _inverse_length(squared)
+
+
+def _slope_of(pull: Callable[..., Array], squared: Array, stiffness: Array, rest_length: Array) -> Array:
+    """By the length and not by its square, since cubes of lengths would come in, and leave the range of float32."""
+    length = length_of(squared)
+    value, rate = jax.jvp(lambda r: pull(r, stiffness, rest_length), (length,), (jnp.ones_like(length),))
+    return rate - value * _inverse_length(squared)
 
 
 def _power(base: Array, exponent: float) -> Array:

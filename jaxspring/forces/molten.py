@@ -37,20 +37,20 @@ class Molten(eqx.Module):
         if self.net.n_springs == 0:
             return jnp.ones(self.net.node_shape, bool)
         shapes = self.net.family_shapes
-        given = shapes if state.alive is None else tuple(entry.shape for entry in state.alive.families)
-        if given != shapes:
+        alive = self.net.own(jnp.ones(shape, bool) for shape in shapes) if state.alive is None else state.alive
+        given = tuple(entry.shape for entry in alive.families)
+        if not self.net.owns(alive) or given != shapes:
             raise ValueError(
-                f"state.alive tells about springs in families of shapes {given}, but this net is a {_described(self.net)}.\n"
+                f"state.alive tells about springs in families of shapes {given}{_whose(alive)}, but this net is a {_described(self.net)}.\n"
                 f"Pass the net that the springs and Fusing were built on; for frames of a run, use jax.vmap."
             )
-        alive = EdgeField(tuple(jnp.ones(shape, bool) for shape in shapes)) if state.alive is None else state.alive
         return self.net.incident_sum(alive.map(lambda a: a.astype(jnp.float32))) == 0
 
 
 def check_springs(who: str, net: Topology, forces: tuple[Force, ...]) -> None:
     """Raise ValueError where there are springs, but none on the net of `who`: what is alive there would not be theirs."""
     nets = [force.net for force in forces if isinstance(force, Springs)]
-    if nets and all(other.family_shapes != net.family_shapes for other in nets):
+    if nets and all(other.identity != net.identity for other in nets):
         raise ValueError(
             f"{who} has a {_described(net)}, but the Springs of this system have a {_described(nets[0])}.\n"
             f"Unchecked, {who} would tell about springs that nothing holds, and those of Springs would never break, without a word.\n"
@@ -59,4 +59,8 @@ def check_springs(who: str, net: Topology, forces: tuple[Force, ...]) -> None:
 
 
 def _described(net: Topology) -> str:
-    return f"{type(net).__name__} of {net.n_springs} springs in families of shapes {net.family_shapes}"
+    return f"{type(net).__name__} of {net.n_springs} springs in families of shapes {net.family_shapes} ({net.identity})"
+
+
+def _whose(field: EdgeField) -> str:
+    return "" if field.identity is None else f" ({field.identity})"

@@ -8,8 +8,9 @@ Source: slide "Force Computation" (length |r|, deformation e = |r| - l).
 from __future__ import annotations
 
 import abc
+from collections.abc import Callable
 from functools import partial
-from typing import Any, TypeGuard
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -24,8 +25,9 @@ from ..topology.base import Topology
 from ..topology.edge_field import EdgeField, ZeroOutside
 from ..vector import Vector
 from .base import Finding, Force, any_refused
-from .laws import Hooke, Law, PowerLaw, spring_block, spring_energy, spring_pull
+from .laws import Hooke, Law, PowerLaw, TensionOnly, has_no_direction, is_beyond_range, length_of, spring_block, spring_energy, spring_pull
 from .linearisation import Linearisation
+from .living import counted, heeding, living, map_living
 
 
 class StiffnessRule(eqx.Module):
@@ -77,8 +79,8 @@ class Springs(Force):
         allow_negative_stiffness: accept stiffnesses below zero, which push without bound.
         expansion: an `ExpansionRule` that multiplies the rest lengths, or None.
 
-    A state whose `alive` or `rest_length` has the shape of this net's springs is heeded: a broken spring does nothing, and rest lengths
-    that have changed take the place of the given ones.
+    A state whose `alive` or `rest_length` is of this net's springs is heeded: a broken spring does nothing, whatever its constants are, and
+    rest lengths that have changed take the place of the given ones.
 
     Raises:
         ValueError: a negative or non-finite constant (named with its index), a shape that fits neither one number nor one per spring.
@@ -131,11 +133,11 @@ class Springs(Force):
         """Sum of the pulls at each node [N]."""
         if self.net.n_springs == 0:
             return Vector.zeros_like(state.position)
+        pull = partial(spring_pull, self.law)
         if isinstance(self.stiffness, ZeroOutside) and self.law.is_finite_at_zero:
-            return self._embed(self.net.net_pull(partial(spring_pull, self.law), self._seen(state), *self._constants(state)), state)
-        d, k, l = self._along(state)
-        pulls = self.net.map_springs(partial(spring_pull, self.law), d, k, l)
-        return self._embed(self.net.accumulate(pulls), state)
+            pull, constants = heeding(self.net, state, pull, *self._constants(state))
+            return self._embed(self.net.net_pull(pull, self._seen(state), *constants), state)
+        return self._embed(self.net.accumulate(self._each(state, pull)), state)
 
     def energy(self, state: State) -> Array | None:
         """Sum of the springs' energies [J]; None where the law has none."""
@@ -146,14 +148,14 @@ class Springs(Force):
         one = jnp.ones((), state.dtype)
         if self.law.energy(one, one, one) is None:
             return None
-        return self.net.sum(self.net.map_springs(lambda *spring: spring_energy(self.law, *spring), *self._along(state)))
+        return self.net.sum(self._each(state, partial(spring_energy, self.law)))
 
     def stiffness_blocks(self, state: State, linearisation: Linearisation) -> Blocks | None:
         """One block per spring [N/m]; a stiffness that follows the state is taken as constant."""
         if self.net.n_springs == 0:
             return None
-        blocks = self.net.map_springs(lambda *spring: spring_block(self.law, linearisation, *spring), *self._along(state))
-        weight, slope, direction = (EdgeField(column) for column in zip(*blocks.families, strict=True))
+        blocks = self._each(state, partial(spring_block, self.law, linearisation))
+        weight, slope, direction = (self.net.own(column) for column in zip(*blocks.families, strict=True))
         if slope.families[0] is None:
             return Blocks(springs=(SpringBlocks(self.net, weight, None, None, self.axes),))
         return Blocks(springs=(SpringBlocks(self.net, weight, slope, direction, self.axes),))
@@ -167,20 +169,20 @@ class Springs(Force):
         return isinstance(self.stiffness, StiffnessRule) or self.expansion is not None or self.energy(state) is None
 
     def tension(self, state: State) -> EdgeField:
-        """Pull of each spring along itself [N]: positive stretched, negative squeezed. `net.flatten` gives (E,)."""
+        """Pull of each spring along itself [N]: positive stretched, negative squeezed, zero broken. `net.flatten` gives (E,)."""
 
         def of_family(d: Vector, k: Array, l: Array) -> Array:
-            return self.law.weight(d.dot(d), k, l) * d.norm()
+            squared = d.dot(d)
+            return self.law.weight(squared, k, l) * length_of(squared)
 
-        return self.net.map_springs(of_family, *self._along(state))
+        return self._each(state, of_family)
 
     def strain(self, state: State) -> EdgeField:
-        """Stretch over rest length, (r - l) / l; infinite where l = 0."""
-        d, _, l = self._along(state)
-        return self.net.map_springs(lambda d, l: d.norm() / l - 1, d, l)
+        """Stretch over rest length, (r - l) / l; infinite where l = 0, zero where broken."""
+        return self._each(state, lambda d, _, l: d.norm() / l - 1)
 
     def stiffness_bound(self, state: State) -> Array | None:
-        """Gershgorin: twice the sum of the stiffnesses at each node [N/m]."""
+        """Gershgorin: twice the sum of the stiffnesses at each node [N/m]. A broken spring counts with k: it may come back."""
         if self.net.n_springs == 0:
             return None
         k = self.stiffness.upper_bound() if isinstance(self.stiffness, StiffnessRule) else self.net.edge_field(self.stiffness)
@@ -188,18 +190,27 @@ class Springs(Force):
         return 2 * self.net.incident_sum(k)
 
     def diagnose(self, state: State) -> tuple[Finding, ...]:
-        """COINCIDENT: springs with a rest length whose ends are at one place."""
-        given = state.rest_length is None and is_concrete(self.rest_length)
+        """COINCIDENT: springs whose ends are at one place, or so near that the square of their distance underflows, where they have a rest
+        length; under a law of one's own also without, unless they are at one place exactly. NONFINITE: springs so long that it overflows.
+        """
+        is_linear = isinstance(self.law, Hooke | TensionOnly)
+        given = state.rest_length is None and is_concrete(self.rest_length) and is_linear
         if self.net.n_springs == 0 or (given and not jnp.any(self.rest_length > 0)):
+            # A pull k d takes no square.
             return ()
-        d, _, l = self._along(state)
 
-        def degenerate(d: Vector, l: Array) -> Array:
-            squared = d.dot(d)
-            return ((squared <= tiny(squared.dtype)) & (l > 0)).astype(jnp.int32)
+        def coincident(d: Vector, _: Array, l: Array) -> Array:
+            needs_direction = l > 0
+            if not is_linear:
+                needs_direction = needs_direction | (jnp.max(jnp.abs(jnp.stack(tuple(d))), axis=0) > 0)
+            return (has_no_direction(d) & needs_direction).astype(jnp.int32)
 
-        count = self.net.sum(self.net.map_springs(degenerate, d, l))
-        return (Finding(Flag.COINCIDENT, count, jnp.asarray(-1, jnp.int32)),)
+        def beyond(d: Vector, _: Array, l: Array) -> Array:
+            return is_beyond_range(d).astype(jnp.int32)
+
+        nowhere = jnp.asarray(-1, jnp.int32)
+        counts = (self.net.sum(self._each(state, of_family)) for of_family in (coincident, beyond))
+        return tuple(Finding(flag, n, nowhere) for flag, n in zip((Flag.COINCIDENT, Flag.NONFINITE), counts, strict=True))
 
     def invalid(self) -> Array | None:
         """Whether a constant is negative or not finite."""
@@ -217,8 +228,9 @@ class Springs(Force):
         if self.net.n_springs == 0:
             return None
         d, _, l = self._along(state)
-        # Flat, so that two reductions serve all families.
-        length = self.net.flatten(d.map(lambda family: family.norm()))
+        # Flat, so that two reductions serve all families. A broken spring has length and rest length zero here, which count for nothing.
+        length = self.net.flatten(map_living(self.net, state, lambda d: d.norm(), d))
+        l = l if living(self.net, state) is None else map_living(self.net, state, lambda l: l, l)
         rest = self.net.flatten(l) if isinstance(l, EdgeField) else jnp.broadcast_to(l, length.shape)
         never = jnp.full_like(length, jnp.inf)
         finest = jnp.min(jnp.where(rest > 0, jnp.minimum(jnp.where(length > 0, length, never), rest), never))
@@ -230,18 +242,16 @@ class Springs(Force):
     def natural_length(self, state: State) -> Array | EdgeField:
         """Rest length of each spring in this state [m]: the state's own where it has one, else the given one, times the expansion."""
         changed = state.rest_length
-        is_changed = changed is not None and self._is_of_this_net(changed)
+        is_changed = changed is not None and self.net.owns(changed)
         l: Any = changed if is_changed else cast_inexact(self.net.edge_field(self.rest_length, "rest_length"), state.dtype)
         if self.expansion is None:
             return l
-        return self.net.map_springs(lambda l, factor: l * factor, l, cast_inexact(self.expansion, state.dtype).factor(self.net, state))
+        factor = cast_inexact(self.expansion, state.dtype).factor(self.net, state)
+        return map_living(self.net, state, lambda l, factor: l * factor, l, factor)
 
     @property
     def _follows_position(self) -> bool:
         return isinstance(self.stiffness, StiffnessRule) and self.stiffness.follows_position
-
-    def _is_of_this_net(self, field: EdgeField | None) -> TypeGuard[EdgeField]:
-        return field is not None and tuple(entry.shape for entry in field.families) == self.net.family_shapes
 
     def _seen(self, state: State) -> Vector:
         return state.position if self.axes is None else Vector(tuple(state.position[a] for a in self.axes))
@@ -249,11 +259,11 @@ class Springs(Force):
     def _constants(self, state: State) -> tuple[Array | EdgeField, Array | EdgeField]:
         rule = self.stiffness
         k = rule.stiffness(self.net, state) if isinstance(rule, StiffnessRule) else self.net.edge_field(rule, "stiffness")
-        k, l = cast_inexact((k, self.natural_length(state)), state.dtype)
-        if self._is_of_this_net(state.alive):
-            # `where`, since zero times what is not finite is not zero.
-            k = self.net.map_springs(lambda whole, k: jnp.where(whole, k, jnp.zeros((), k.dtype)), state.alive, k)
-        return k, l
+        return cast_inexact((k, self.natural_length(state)), state.dtype)
+
+    def _each(self, state: State, function: Callable[..., Any]) -> EdgeField:
+        """`function(d, k, l)` of every spring; zero of a broken one."""
+        return map_living(self.net, state, function, *self._along(state))
 
     def _along(self, state: State) -> tuple[EdgeField, Array | EdgeField, Array | EdgeField]:
         k, l = self._constants(state)
@@ -263,7 +273,7 @@ class Springs(Force):
     def _filled(self, d: EdgeField) -> EdgeField:
         """Length above zero in a lattice's margins: there a user's law would be taken at length zero, and its NaN reach the gradient."""
         columns = [self.net.inside(d.map(lambda v, i=i: v[i]), 1.0).families for i in range(len(d[0]))]
-        return EdgeField(tuple(Vector(parts) for parts in zip(*columns, strict=True)))
+        return self.net.own(Vector(parts) for parts in zip(*columns, strict=True))
 
     def _embed(self, force: Vector, state: State) -> Vector:
         if self.axes is None:
@@ -282,7 +292,9 @@ class Springs(Force):
             is_long = squared > tiny(squared.dtype)
             return jnp.where(is_long, jnp.maximum(jnp.maximum(weight, radial), jnp.zeros((), squared.dtype)), k)
 
-        return self.net.map_springs(of_family, d, k, l)
+        steepest = map_living(self.net, state, of_family, d, k, l)
+        alive = living(self.net, state)
+        return steepest if alive is None else self.net.map_springs(counted, steepest, k, alive)
 
 
 def _edge_constant(net: Topology, name: str, value: Any) -> Any:

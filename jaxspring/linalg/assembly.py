@@ -6,15 +6,15 @@ the same springs) share one factor.
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
-from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..topology.base import Topology
+from ..topology.base import NodeLayout, Topology
+from ..topology.identity import NetIdentity
 from ..topology.permutation import Permutation
 from .envelope import Panels
 from .operators import SpringBlocks, SpringMatrix
@@ -29,7 +29,7 @@ class SpringPlaces:
     Compared and hashed by content, so that it can be static under `jit`.
 
     Attributes:
-        net: the structure of the net, which tells it from others.
+        net: what tells the net from others: its springs, and how its nodes are numbered inside.
         later: (E,) place of the later end, springs in the user's order.
         earlier: (E,) place of the earlier end.
     """
@@ -37,7 +37,7 @@ class SpringPlaces:
     def __init__(self, net: Topology, places: np.ndarray):
         place = np.argsort(places)
         ends = place[net.edges]
-        self.net = structure(net)
+        self.net = _key(net)
         self.later, self.earlier = ends.max(axis=1), ends.min(axis=1)
         self._digest = hashlib.sha256(ends.tobytes()).hexdigest()
 
@@ -48,9 +48,9 @@ class SpringPlaces:
         return self is other or (isinstance(other, SpringPlaces) and self._digest == other._digest and self.net == other.net)
 
 
-def structure(net: Topology) -> Any:
-    """What is static of a net, its numbering included; the same whether its arrays are traced or not."""
-    return jax.tree.structure(net.unboxed())
+def _key(net: Topology) -> tuple[NetIdentity, NodeLayout]:
+    """Compared by content, also after pickling; the same whether the net's arrays are traced or not."""
+    return dataclasses.replace(net.identity, name=None), net.layout
 
 
 def alike_coordinates(matrix: SpringMatrix) -> tuple[Alike, ...]:
@@ -141,7 +141,7 @@ def store_entries(entries: Array, addresses: Array, panels: Panels) -> Array:
 
 def find_places(places: tuple[SpringPlaces, ...], term: SpringBlocks) -> SpringPlaces:
     """The ends of a term's springs. Raises ValueError where the analysis did not see their net."""
-    wanted = structure(term.net)
+    wanted = _key(term.net)
     for spring in places:
         if spring.net == wanted:
             return spring
@@ -161,5 +161,4 @@ __all__ = [
     "read_entries",
     "spring_terms",
     "store_entries",
-    "structure",
 ]

@@ -53,7 +53,9 @@ class Lineax(IterativeSolver):
         if getattr(solver, "atol", None) == 0 and solver.rtol != 0:
             raise ValueError("solver.atol is 0: at a coordinate that does not move lineax divides 0 by 0 and stops; set atol=1e-12")
         self.solver = solver
-        self.tags = (lineax.symmetric_tag, lineax.positive_semidefinite_tag) if tags is None else tuple(tags)
+        given = (lineax.symmetric_tag, lineax.positive_semidefinite_tag) if tags is None else tuple(tags)
+        # By name: lineax compares its tags by identity, which neither pickle nor deepcopy keeps.
+        self.tags = tuple(repr(tag) if getattr(lineax, repr(tag), None) is tag else tag for tag in given)
         self.tolerance = getattr(solver, "rtol", None) if tolerance is None else tolerance
         self.adjoint_tolerance = None
         self.max_iter = None
@@ -68,7 +70,8 @@ class Lineax(IterativeSolver):
         if precondition is not identity:
             definite = lineax.positive_semidefinite_tag
             options["preconditioner"] = lineax.FunctionLinearOperator(precondition, structure, (lineax.symmetric_tag, definite))
-        operator = lineax.FunctionLinearOperator(matvec, structure, self.tags)
+        tags = tuple(getattr(lineax, tag) if isinstance(tag, str) else tag for tag in self.tags)
+        operator = lineax.FunctionLinearOperator(matvec, structure, tags)
         solution = lineax.linear_solve(operator, b, self.solver, options=options, throw=False)
         results = lineax.RESULTS
         flags = (

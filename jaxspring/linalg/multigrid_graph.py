@@ -220,9 +220,7 @@ def _ends(net: Topology) -> tuple[np.ndarray, np.ndarray]:
 
 def _is_on(term: SpringBlocks, net: Topology) -> bool:
     """Whether a term's springs are those of the net."""
-    if isinstance(net, Graph):
-        return isinstance(term.net, Graph) and (term.net.nodes, term.net.springs) == (net.nodes, net.springs)
-    return isinstance(term.net, Lattice) and isinstance(net, Lattice) and term.net.grid_shape == net.grid_shape
+    return term.net.identity.has_springs_of(net.identity) and term.net.layout == net.layout
 
 
 def _flat_blocks(term: SpringBlocks, dim: int, dtype: jnp.dtype) -> Array:

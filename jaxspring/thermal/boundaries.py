@@ -24,7 +24,7 @@ from .._arrays import as_mask, own
 from .._checks import as_inexact, finite, has_shape, is_concrete, nonnegative
 from ..forces.base import any_refused
 from ..state import State
-from ..topology.base import Topology
+from ..topology.base import NodeLayout, Topology
 
 Given = Any  # an array, or a function of time [s] that gives one
 
@@ -48,6 +48,12 @@ class ThermalBoundary(eqx.Module):
         Raises:
             ValueError: nodes that are those of another net.
         """
+        layout = getattr(self, "layout", net.layout)
+        if layout != net.layout:
+            raise ValueError(
+                f"{name} ({type(self).__name__}) names nodes on a net of shape {layout.shape}, in an order of its own inside; Heat's net "
+                f"has shape {net.node_shape}. Unchecked, it would act on other nodes. Build it with the net that you give Heat."
+            )
         for mask in (getattr(self, "nodes", None), self.held()):
             if mask is not None and mask.shape != net.node_shape:
                 raise ValueError(
@@ -88,6 +94,7 @@ class FixedTemperature(ThermalBoundary):
     Attributes:
         nodes: bool, node shape.
         temperature: [K]: a number, a node array, or a function of time [s] that gives one.
+        layout: how the nodes of the net are kept (static).
 
     Raises:
         ValueError: a wrong shape, a temperature that is not finite.
@@ -101,6 +108,7 @@ class FixedTemperature(ThermalBoundary):
     is_linear: ClassVar[bool] = True
     nodes: Array
     temperature: Given
+    layout: NodeLayout = eqx.field(static=True)
 
     def __init__(self, net: Topology, nodes: Any, temperature: Any):
         """Check what is given, and bring it to the shape of the net.
@@ -110,7 +118,7 @@ class FixedTemperature(ThermalBoundary):
             nodes: (N,) booleans in the user's order.
             temperature: [K]: a number, (N,) in the user's order, or a function of time [s] that gives a number or a node array.
         """
-        self.nodes = _mask(net, nodes)
+        self.nodes, self.layout = _mask(net, nodes), net.layout
         self.temperature = _given(net, "temperature", temperature)
 
     def held(self) -> Array:
@@ -129,6 +137,7 @@ class HeatFlux(ThermalBoundary):
         nodes: bool, node shape.
         flux: [W/m^2], positive heats: a number, a node array, or a function of time [s] that gives one.
         area: surface of each node [m^2], a number or a node array.
+        layout: how the nodes of the net are kept (static).
 
     Raises:
         ValueError: a wrong shape, a flux that is not finite, a negative area.
@@ -139,6 +148,7 @@ class HeatFlux(ThermalBoundary):
     nodes: Array
     flux: Given
     area: Array
+    layout: NodeLayout = eqx.field(static=True)
 
     def __init__(self, net: Topology, nodes: Any, flux: Any, area: Any):
         """Check what is given, and bring it to the shape of the net.
@@ -149,7 +159,7 @@ class HeatFlux(ThermalBoundary):
             flux: [W/m^2]: a number, (N,) in the user's order, or a function of time [s] that gives a number or a node array.
             area: [m^2]: a number, or (N,) in the user's order.
         """
-        self.nodes = _mask(net, nodes)
+        self.nodes, self.layout = _mask(net, nodes), net.layout
         self.flux = _given(net, "flux", flux)
         self.area = _nonnegative(net, "area", area)
 
@@ -173,6 +183,7 @@ class Convection(ThermalBoundary):
         coefficient: h [W/(m^2 K)], a number or a node array.
         ambient: temperature of the fluid [K]: a number, a node array, or a function of time [s] that gives one.
         area: surface of each node [m^2], a number or a node array.
+        layout: how the nodes of the net are kept (static).
 
     Raises:
         ValueError: a wrong shape, a negative coefficient or area, a temperature that is not finite.
@@ -184,6 +195,7 @@ class Convection(ThermalBoundary):
     coefficient: Array
     ambient: Given
     area: Array
+    layout: NodeLayout = eqx.field(static=True)
 
     def __init__(self, net: Topology, nodes: Any, coefficient: Any, ambient: Any, area: Any):
         """Check what is given, and bring it to the shape of the net.
@@ -195,7 +207,7 @@ class Convection(ThermalBoundary):
             ambient: [K]: a number, (N,) in the user's order, or a function of time [s] that gives a number or a node array.
             area: [m^2]: a number, or (N,) in the user's order.
         """
-        self.nodes = _mask(net, nodes)
+        self.nodes, self.layout = _mask(net, nodes), net.layout
         self.coefficient = _nonnegative(net, "coefficient", coefficient)
         self.ambient = _given(net, "ambient", ambient)
         self.area = _nonnegative(net, "area", area)
@@ -224,6 +236,7 @@ class Radiation(ThermalBoundary):
         emissivity: between 0 and 1, a number or a node array.
         ambient: temperature of the surroundings [K]: a number, a node array, or a function of time [s] that gives one.
         area: surface of each node [m^2], a number or a node array.
+        layout: how the nodes of the net are kept (static).
 
     Raises:
         ValueError: a wrong shape, an emissivity below 0 or above 1, a negative area, a temperature that is not finite.
@@ -234,6 +247,7 @@ class Radiation(ThermalBoundary):
     emissivity: Array
     ambient: Given
     area: Array
+    layout: NodeLayout = eqx.field(static=True)
 
     def __init__(self, net: Topology, nodes: Any, emissivity: Any, ambient: Any, area: Any):
         """Check what is given, and bring it to the shape of the net.
@@ -245,7 +259,7 @@ class Radiation(ThermalBoundary):
             ambient: [K]: a number, (N,) in the user's order, or a function of time [s] that gives a number or a node array.
             area: [m^2]: a number, or (N,) in the user's order.
         """
-        self.nodes = _mask(net, nodes)
+        self.nodes, self.layout = _mask(net, nodes), net.layout
         self.emissivity = _nonnegative(net, "emissivity", emissivity)
         if is_concrete(self.emissivity) and bool(jnp.any(self.emissivity > 1)):
             raise ValueError(

@@ -53,7 +53,7 @@ class Fusing(Rule):
     """Springs break at the melting point. Belongs to a system's `rules`, after `Heat`.
 
     Attributes:
-        net: the system's net.
+        net: whose springs fuse; those of other nets over the same nodes stay whole.
         melting: theta_m [K].
         refreezing: `Refreezing`, or None: what is broken stays so.
         springs: those whose rest lengths change when they come back; the system fills it in.
@@ -93,7 +93,7 @@ class Fusing(Rule):
         check_springs("Fusing", self.net, forces)
         if self.refreezing is None:
             return self
-        own = [f for f in forces if isinstance(f, Springs) and f.net.family_shapes == self.net.family_shapes]
+        own = [f for f in forces if isinstance(f, Springs) and f.net.identity == self.net.identity]
         if len(own) != 1:
             raise ValueError(f"refreezing needs one Springs on the net of Fusing, whose rest lengths change; this system has {len(own)}.")
         return eqx.tree_at(lambda r: r.springs, self, own[0], is_leaf=lambda leaf: leaf is None)
@@ -102,15 +102,26 @@ class Fusing(Rule):
         """The state with a bit for every spring and, where springs come back, a rest length of every spring."""
         temperature_of(state, "Fusing")
         if state.alive is None:
-            whole = EdgeField(tuple(jnp.ones(shape, bool) for shape in self.net.family_shapes))
+            whole = self.net.own(jnp.ones(shape, bool) for shape in self.net.family_shapes)
             state = dataclasses.replace(state, alive=whole)
-        elif tuple(entry.shape for entry in state.alive.families) != self.net.family_shapes:
-            raise ValueError("state.alive is of another net than Fusing. Build both on the system's net.")
+        elif not self.net.owns(state.alive):
+            raise ValueError(
+                f"state.alive is of another net than Fusing: it tells about the springs of {state.alive.identity or 'no known net'}, and "
+                f"Fusing about those of {self.net.identity}. A state knows the broken springs of one net only: build both on it."
+            )
+        # The same kind of field as a step leaves it, also where it was made by hand.
+        state = dataclasses.replace(state, alive=self.net.own(state.alive.families))
         if self.refreezing is not None and self.springs is not None and state.rest_length is None:
             given = cast_inexact(self.springs.net.edge_field(self.springs.rest_length, "rest_length"), state.dtype)
             lengths = given.families if isinstance(given, EdgeField) else (given,) * len(self.net.family_shapes)
             full = tuple(jnp.broadcast_to(l, shape) for l, shape in zip(lengths, self.net.family_shapes, strict=True))
-            state = dataclasses.replace(state, rest_length=EdgeField(full))
+            state = dataclasses.replace(state, rest_length=self.net.own(full))
+        elif state.rest_length is not None and self.refreezing is not None:
+            if not self.net.owns(state.rest_length):
+                raise ValueError(
+                    f"state.rest_length is of another net than Fusing, whose net is {self.net.identity}. Build both on that net."
+                )
+            state = dataclasses.replace(state, rest_length=self.net.own(state.rest_length.families))
         return state
 
     def update(self, before: State, state: State, dt: Array) -> tuple[State, Status]:

@@ -22,7 +22,7 @@ from jaxtyping import Array
 from .._checks import as_inexact, finite, has_shape, nonnegative, positive
 from ..forces.base import Rule, any_refused
 from ..linalg.operators import SpringBlocks
-from ..numerics import cast_inexact, is_traced, stopped
+from ..numerics import cast_inexact, stopped
 from ..state import State
 from ..status import Flag, Status
 from ..topology.base import Topology
@@ -227,9 +227,11 @@ class Heat(Rule):
                 "cut_by says that broken springs conduct nothing, but no spring of this state can break (its `alive` is None). Add the "
                 "rule that breaks springs, or pass cut_by=None."
             )
-        shapes = tuple(entry.shape for entry in state.alive.families)
-        if shapes != self.cut_by.family_shapes:
-            raise ValueError(f"state.alive has families of shapes {shapes}; those of cut_by are {self.cut_by.family_shapes}.")
+        if not self.cut_by.owns(state.alive):
+            raise ValueError(
+                f"state.alive tells about other springs than those of cut_by ({self.cut_by.identity}): they are of "
+                f"{state.alive.identity or 'no known net'}, in families of shapes {tuple(entry.shape for entry in state.alive.families)}."
+            )
         alive = EdgeField(tuple(state.alive.families[i] for i in self.families))
         # `where`, since zero times a conductance that is not finite is not zero.
         return self.conductance.map(lambda g, is_whole: jnp.where(is_whole, g, jnp.zeros_like(g)), alive)
@@ -239,7 +241,7 @@ class Heat(Rule):
         capacity = jnp.broadcast_to(self.capacity, self.net.node_shape)
         conductance = self.net.edge_field(self.conductance, "conductance")
         if not isinstance(conductance, EdgeField):
-            conductance = EdgeField(tuple(jnp.broadcast_to(conductance, shape) for shape in self.net.family_shapes))
+            conductance = self.net.own(jnp.broadcast_to(conductance, shape) for shape in self.net.family_shapes)
         ready = eqx.tree_at(lambda h: (h.capacity, h.conductance), self, (capacity, self.net.inside(conductance, 0)))
         return cast_inexact(ready, dtype)
 
@@ -321,13 +323,9 @@ def _shared_families(net: Topology, cut_by: Topology) -> tuple[int, ...]:
             f"cut_by has the springs {cut_by.offsets} on shape {cut_by.shape}, net {net.offsets} on {net.shape}: heat can only be cut "
             f"where every spring of net is one of cut_by. Build both on one shape."
         )
-    if net is not cut_by and (is_traced(net, cut_by) or not _same_springs(net, cut_by)):
+    if not net.identity.has_springs_of(cut_by.identity):
         raise ValueError("cut_by must hold the springs of net, in the same order. Pass the system's net for both.")
     return tuple(range(len(net.family_shapes)))
-
-
-def _same_springs(net: Topology, other: Topology) -> bool:
-    return type(net) is type(other) and net.n_nodes == other.n_nodes and np.array_equal(net.edges, other.edges)
 
 
 __all__ = ["Heat", "total_heat"]

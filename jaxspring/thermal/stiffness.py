@@ -21,6 +21,7 @@ from jaxtyping import Array
 
 from .._checks import as_inexact, finite, has_shape, is_concrete, nonnegative, positive
 from ..forces.base import any_refused
+from ..forces.living import map_living
 from ..forces.springs import ExpansionRule, StiffnessRule
 from ..numerics import cast_inexact
 from ..state import State
@@ -78,12 +79,12 @@ class ThermalStiffness(StiffnessRule):
         warm = net.average(temperature_of(state, "ThermalStiffness"))
         full, low, high = cast_inexact((net.edge_field(self.full, "stiffness"), self.softening, self.melting), state.dtype)
         b = None if self.sharpness is None else self.sharpness.astype(state.dtype)
-        return net.map_springs(lambda full, theta: full * _share((high - theta) / (high - low), b), full, warm)
+        return map_living(net, state, lambda full, theta: full * _share((high - theta) / (high - low), b), full, warm)
 
     def upper_bound(self) -> Any:
-        """The largest of the full stiffnesses [N/m]."""
+        """The largest of the full stiffnesses [N/m]. One that is not finite is left out: it is refused, or its spring is broken."""
         entries = self.full.families if isinstance(self.full, EdgeField) else (self.full,)
-        return jnp.max(jnp.stack([jnp.max(entry) for entry in entries]))
+        return jnp.max(jnp.stack([jnp.max(jnp.where(jnp.isfinite(entry), entry, jnp.zeros_like(entry))) for entry in entries]))
 
     def invalid(self) -> Array:
         """Whether a constant is one that the constructor refuses."""

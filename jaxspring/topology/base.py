@@ -9,10 +9,11 @@
 from __future__ import annotations
 
 import abc
+import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -23,6 +24,7 @@ from .._arrays import own
 from .._checks import as_inexact, finite, has_shape, shape_of
 from ..vector import Vector
 from .edge_field import EdgeField
+from .identity import NetIdentity
 from .permutation import Permutation
 
 
@@ -60,6 +62,11 @@ class Topology(eqx.Module):
     @abc.abstractmethod
     def family_shapes(self) -> tuple[tuple[int, ...], ...]:
         """Shape of each entry of an edge field."""
+
+    @property
+    @abc.abstractmethod
+    def identity(self) -> NetIdentity:
+        """What tells these springs from those of another net. Known from what is static, so that a traced net has it too."""
 
     @property
     @abc.abstractmethod
@@ -106,6 +113,26 @@ class Topology(eqx.Module):
     def _flatten(self, field: EdgeField) -> Array:
         """Edge field in full shape -> (E,) array in the user's order."""
 
+    def named(self, name: str | None) -> Self:
+        """The same net under a name: a set of springs of its own, with its own broken springs, though another net has the same edges.
+
+        >>> import jaxspring as js
+        >>> net = js.lattice(3)
+        >>> net.named("stiff").identity == net.identity
+        False
+        """
+        return dataclasses.replace(self, name=name)
+
+    def owns(self, field: EdgeField) -> bool:
+        """Whether an edge field tells about the springs of this net. One made by hand does not say, and is taken by its shapes."""
+        if field.identity is not None:
+            return field.identity == self.identity
+        return tuple(shape_of(entry) for entry in field.families) == self.family_shapes
+
+    def own(self, families: Iterable[Any]) -> EdgeField:
+        """An edge field of this net from an entry for each spring family."""
+        return EdgeField(tuple(families), self.identity)
+
     @abc.abstractmethod
     def unboxed(self) -> Topology:
         """The same springs without periods: a velocity is a difference of neighbouring images, and is never wrapped."""
@@ -142,7 +169,7 @@ class Topology(eqx.Module):
         """Call `law` once per spring family; a number or 0-d array is passed to every family as it is."""
         count = len(self.family_shapes)
         columns = [f.families if isinstance(f, EdgeField) else (f,) * count for f in fields]
-        return EdgeField(tuple(law(*entries) for entries in zip(*columns, strict=True)))
+        return self.own(law(*entries) for entries in zip(*columns, strict=True))
 
     def edge_field(self, value: Any, name: str = "value") -> Array | EdgeField:
         """A number, an (E,) array in the user's order, an edge field, or on a lattice numbers by family, in the shape of the topology.
@@ -152,7 +179,7 @@ class Topology(eqx.Module):
         """
         if isinstance(value, EdgeField):
             self._check_families(name, value)
-            return self._spread(value)
+            return dataclasses.replace(self._spread(value), identity=self.identity)
         value = self.edge_constant(value, name)
         if isinstance(value, EdgeField):
             return self._spread(value)
@@ -167,7 +194,7 @@ class Topology(eqx.Module):
             value = EdgeField(self._by_family(value, name))
         if isinstance(value, EdgeField):
             self._check_families(name, value)
-            return EdgeField(tuple(as_inexact(f"{name}.families[{i}]", entry) for i, entry in enumerate(value.families)))
+            return self.own(as_inexact(f"{name}.families[{i}]", entry) for i, entry in enumerate(value.families))
         value = as_inexact(name, value)
         has_shape(name, value, {"one number": (), "one per spring": (self.n_springs,)})
         return value
@@ -181,12 +208,18 @@ class Topology(eqx.Module):
         fits = len(shapes) == len(self.family_shapes)
         if not (fits and all(shape in ((), full) for shape, full in zip(shapes, self.family_shapes, strict=True))):
             raise ValueError(f"{name} is an edge field of shapes {shapes}; this topology has {self.family_shapes}.")
+        if field.identity is not None and not field.identity.has_springs_of(self.identity):
+            raise ValueError(
+                f"{name} is an edge field of another net with fields of the same shapes ({field.identity}; here {self.identity}): its "
+                f"values would go to other springs. Make it with this net, e.g. net.edge_field(array)."
+            )
 
     def _spread(self, field: EdgeField) -> EdgeField:
         """The field with the numbers of whole families in full shape."""
         if all(shape_of(entry) for entry in field.families):
             return field
-        return EdgeField(tuple(jnp.broadcast_to(a, shape) for a, shape in zip(field.families, self.family_shapes, strict=True)))
+        families = tuple(jnp.broadcast_to(a, shape) for a, shape in zip(field.families, self.family_shapes, strict=True))
+        return dataclasses.replace(field, families=families)
 
     def node_field(self, value: Any, name: str = "value") -> Array:
         """A number, an (N,) array in the user's order, or an array in node shape, as a node array (a number stays 0-d)."""

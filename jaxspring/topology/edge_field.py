@@ -12,6 +12,7 @@ import numpy as np
 
 from .._arrays import kept, own
 from .._checks import shape_of
+from .identity import NetIdentity
 
 
 def _kept(families: Any) -> Any:
@@ -27,15 +28,18 @@ class EdgeField(eqx.Module):
 
     Attributes:
         families: tuple with one entry per spring family. NumPy arrays are copied.
+        identity: whose springs these are; None in a field made by hand, which is taken for that of any net whose shapes it has (static).
     """
 
     families: tuple[Any, ...] = eqx.field(converter=_kept)
+    identity: NetIdentity | None = eqx.field(static=True, default=None)
 
     __array_ufunc__ = None
 
     def map(self, function: Callable[..., Any], *others: EdgeField) -> EdgeField:
-        """Apply `function` to each family (and those of `others`)."""
-        return EdgeField(tuple(function(*entries) for entries in zip(self.families, *(o.families for o in others), strict=True)))
+        """Apply `function` to each family (and those of `others`, which must be of the same springs)."""
+        families = zip(self.families, *(o.families for o in others), strict=True)
+        return EdgeField(tuple(function(*entries) for entries in families), _common_identity(self, *others))
 
     @property
     def dtype(self) -> jnp.dtype:
@@ -84,6 +88,17 @@ class EdgeField(eqx.Module):
         if isinstance(other, (np.ndarray, np.generic)):
             other = own("the operand", other, jax.tree.leaves(self.families)[0].dtype)
         return self.map(lambda entry: operation(entry, other))
+
+
+def _common_identity(*fields: EdgeField) -> NetIdentity | None:
+    known = [field.identity for field in fields if field.identity is not None]
+    for other in known[1:]:
+        if not other.has_springs_of(known[0]):
+            raise ValueError(
+                f"Edge fields of two nets were combined: {known[0]}; and {other}. Entry by entry they are about different springs. "
+                f"Make both with one net."
+            )
+    return known[0] if known else None
 
 
 class ZeroOutside(EdgeField):

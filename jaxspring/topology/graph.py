@@ -7,6 +7,7 @@ has shape (N,), an edge field holds one entry of shape (E,). How pulls are summe
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from typing import Any
 
@@ -20,6 +21,7 @@ from .._checks import node_indices
 from ..vector import Vector
 from .base import Topology
 from .edge_field import EdgeField
+from .identity import NetIdentity
 from .lattice import _as_box, minimum_image
 from .permutation import Permutation
 from .reduction import Gather, Reduction, Scatter, choose_reduction
@@ -34,6 +36,8 @@ class Graph(Topology):
         reduction: how pulls are summed on nodes.
         box: (D,) period of each coordinate [m], or None.
         triangles: (T, 3) triangles in the user's numbering, or None.
+        digest: of the springs in the user's numbering and order (static).
+        name: tells it from other nets of the same springs, or None: see `named`.
     """
 
     tails: Int[Array, " E"]
@@ -44,6 +48,8 @@ class Graph(Topology):
     count: int = eqx.field(static=True)
     nodes: Permutation = eqx.field(static=True)
     springs: Permutation = eqx.field(static=True)
+    digest: str = eqx.field(static=True)
+    name: str | None = eqx.field(static=True, default=None)
 
     @staticmethod
     def from_edges(
@@ -87,6 +93,7 @@ class Graph(Topology):
             count=n_nodes,
             nodes=nodes,
             springs=springs,
+            digest=hashlib.sha256(np.ascontiguousarray(pairs, "<i4").data).hexdigest()[:16] if len(pairs) else "",
         )
 
     @property
@@ -109,6 +116,11 @@ class Graph(Topology):
         return field
 
     @property
+    def identity(self) -> NetIdentity:
+        """The springs' digest, and the name."""
+        return NetIdentity("Graph", (f"{self.count} nodes", f"{self.springs.order.size} springs", f"digest {self.digest}"), self.name)
+
+    @property
     def node_permutation(self) -> Permutation:
         """From the user's node order to the internal one."""
         return self.nodes
@@ -126,7 +138,7 @@ class Graph(Topology):
     def difference(self, x: Vector) -> EdgeField:
         """Head minus tail along each spring."""
         d = self._per_array(self.reduction.difference, x)
-        return EdgeField((d if self.box is None else minimum_image(d, self.box),))
+        return self.own((d if self.box is None else minimum_image(d, self.box),))
 
     def accumulate(self, pulls: EdgeField) -> Vector:
         """Force on each node: each pull on its tail, the opposite on its head."""
@@ -138,11 +150,11 @@ class Graph(Topology):
 
     def average(self, a: Array) -> EdgeField:
         """Mean of a node array over the two ends of each spring."""
-        return EdgeField((self.reduction.mean_of_ends(a, self.tails, self.heads),))
+        return self.own((self.reduction.mean_of_ends(a, self.tails, self.heads),))
 
     def split(self, flat: Array) -> EdgeField:
         """(E,) array in the user's order -> edge field."""
-        return EdgeField((self.springs.inward(flat),))
+        return self.own((self.springs.inward(flat),))
 
     def _flatten(self, field: EdgeField) -> Array:
         """Edge field -> (E,) array in the user's order."""

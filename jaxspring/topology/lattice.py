@@ -26,6 +26,7 @@ from ..vector import Vector
 from . import shifts
 from .base import Topology
 from .edge_field import EdgeField
+from .identity import NetIdentity
 
 Offset = tuple[int, ...]
 
@@ -76,17 +77,24 @@ class Lattice(Topology):
         offsets: index offset of each spring family.
         periodic: per axis, whether it wraps.
         box: (D,) period of each coordinate [m], or None; zero means that the coordinate is not periodic.
+        name: tells it from other nets of the same springs, or None: see `named`.
     """
 
     shape: tuple[int, ...] = eqx.field(static=True)
     offsets: tuple[Offset, ...] = eqx.field(static=True)
     periodic: tuple[bool, ...] = eqx.field(static=True)
     box: Array | None
+    name: str | None = eqx.field(static=True, default=None)
 
     @property
     def node_shape(self) -> tuple[int, ...]:
         """Shape of a node field."""
         return self.shape
+
+    @property
+    def identity(self) -> NetIdentity:
+        """Shape, offsets, what wraps, and the name."""
+        return NetIdentity("Lattice", (self.shape, self.offsets, tuple(map(bool, self.periodic))), self.name)
 
     @property
     def node_permutation(self) -> None:
@@ -130,7 +138,7 @@ class Lattice(Topology):
         backward = partial(_minus_accumulate, self.grid_shape)
         columns = [linear_call(forward, backward, (), a) for a in x]
         families = tuple(Vector(parts) for parts in zip(*columns, strict=True))
-        return EdgeField(families if self.box is None else tuple(minimum_image(d, self.box) for d in families))
+        return self.own(families if self.box is None else (minimum_image(d, self.box) for d in families))
 
     def accumulate(self, pulls: EdgeField) -> Vector:
         """Force on each node: each pull on its tail, the opposite on its head, by shifted slices."""
@@ -146,7 +154,7 @@ class Lattice(Topology):
         apart, together = partial(_difference_anywhere, self.grid_shape), partial(_minus_accumulate_anywhere, self.grid_shape)
         columns = [linear_call(apart, together, (), a) for a in x]
         families = (Vector(parts) for parts in zip(*columns, strict=True))
-        d = EdgeField(tuple(families if self.box is None else (minimum_image(d, self.box) for d in families)))
+        d = self.own(families if self.box is None else (minimum_image(d, self.box) for d in families))
         pulls = self.map_springs(pull, d, *fields)
         back = zip(*(p.components for p in pulls.families), strict=True)
         return -Vector(tuple(linear_call(together, apart, (), tuple(column)) for column in back))
@@ -160,7 +168,7 @@ class Lattice(Topology):
     def average(self, a: Array) -> EdgeField:
         """Mean of a node array over the two ends of each spring."""
         ends = linear_call(partial(_sum_of_ends, self.grid_shape), partial(_sum_at_nodes, self.grid_shape), (), a)
-        return EdgeField(tuple(0.5 * both for both in ends))
+        return self.own(0.5 * both for both in ends)
 
     def split(self, flat: Array) -> EdgeField:
         """(E,) array -> edge field, by static slices. Springs that do not exist get the value 1: no length divides by zero."""
@@ -169,7 +177,7 @@ class Lattice(Topology):
             actual = lax.slice(flat, (start,), (start + size,)).reshape(self.grid_shape.actual(offset))
             families.append(shifts.extend(self.grid_shape, actual, offset, 1.0))
             start += size
-        return EdgeField(tuple(families))
+        return self.own(families)
 
     def _flatten(self, field: EdgeField) -> Array:
         """Edge field -> (E,) array."""
@@ -197,7 +205,7 @@ class Lattice(Topology):
     def inside(self, field: EdgeField, fill: float) -> EdgeField:
         """The field with `fill` where a family's margin holds no spring."""
         entries = zip(field.families, self.offsets, strict=True)
-        return EdgeField(tuple(shifts.inside(self.grid_shape, entry, offset, fill) for entry, offset in entries))
+        return self.own(shifts.inside(self.grid_shape, entry, offset, fill) for entry, offset in entries)
 
     def grid(self, spacing: float | Sequence[float] = 1.0) -> np.ndarray:
         """(N, D) rest positions [m] of a grid with `spacing` along x (last axis), y, z."""

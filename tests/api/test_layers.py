@@ -15,6 +15,7 @@ LAYERS = {
     "status": 0,
     "vector": 0,
     "archive": 0,  # files of arrays, whole or not at all
+    "pickling": 0,
     "topology": 1,
     "images": 1,
     "linalg": 2,

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -69,13 +70,14 @@ class Image(eqx.Module):
         """The same geometry and floating type with other pixels `(ny, nx)`; their values are not checked."""
         if jnp.shape(values) != jnp.shape(self.values):
             raise ValueError(f"values has shape {jnp.shape(values)}, but the image has {jnp.shape(self.values)}: pass one value per pixel.")
-        return eqx.tree_at(lambda image: image.values, self, jnp.asarray(values, self.dtype))
+        return eqx.tree_at(lambda image: image.values, self, _own(values, self.dtype))
 
     def normalised(self) -> Image:
         """Pixels scaled to [0, 1] by their whole range; a constant image becomes 0."""
-        low, high = jnp.min(self.values), jnp.max(self.values)
+        values = self.values / 2  # so that the range of any numbers fits their type
+        low, high = jnp.min(values), jnp.max(values)
         extent = jnp.where(high > low, high - low, 1)
-        return self.with_values((self.values - low) / extent)
+        return self.with_values((values - low) / extent)
 
     def surface(self, method: Sampling = Bilinear()) -> Surface:  # noqa: B008 (frozen, holds no array)
         """The image made ready to be read between its pixels. Make it once, outside a loop: `CubicSpline` filters the pixels here."""
@@ -104,11 +106,19 @@ def _per_axis(name: str, value: PerAxis, dtype: jnp.dtype, must_be_positive: boo
         if not isinstance(part, Tracer) and not (np.isfinite(part) and (part > 0 or not must_be_positive)):
             wanted = "positive and finite" if must_be_positive else "finite"
             raise ValueError(f"{name} along {axis} is {part}, but must be {wanted}: every sample would be wrong. Correct {name}.")
-    return jnp.asarray(pair[0], dtype), jnp.asarray(pair[1], dtype)
+    return _own(pair[0], dtype), _own(pair[1], dtype)
+
+
+def _own(value: Any, dtype: jnp.dtype) -> Array:
+    """As an array that does not share the caller's memory: on the CPU, JAX would go on reading a NumPy array that is changed later."""
+    return jnp.asarray(value if isinstance(value, jax.Array) else np.array(value), dtype)
 
 
 def _as_pixels(values: ArrayLike) -> Array:
     """Pixels as a floating array; refuse what is not one channel of finite real numbers, naming what came and what to do."""
+    if isinstance(values, np.ma.MaskedArray) and np.ma.getmaskarray(values).any():
+        row = tuple(int(i) for i in np.argwhere(np.ma.getmaskarray(values))[0])
+        raise ValueError(f"values{list(row)} is masked: what lies under a mask is no pixel. Use image_from_array(values, fill=<number>).")
     array = values if isinstance(values, Tracer) else np.asarray(values)
     dtype = _floating(np.dtype(array.dtype))
     shape = tuple(array.shape)

@@ -20,6 +20,7 @@ from collections.abc import Callable, Sequence
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
@@ -50,14 +51,17 @@ def principal_curvatures(image: Image) -> tuple[Array, Array]:
     """
     dx, dy = image_gradient(image)
     sx, sy = image.spacing
-    dxx = _second_difference(image.values, 1) / (sx * sx)
-    dyy = _second_difference(image.values, 0) / (sy * sy)
-    dxy = _slope(dx, 0) / sy
-    area = 1 + dx * dx + dy * dy
+    # Divided by the area factor w = sqrt(1 + dx^2 + dy^2) and by their own size, so that no square leaves the range of float32.
+    w = _norm(jnp.ones_like(dx), _norm(dx, dy))
+    dxx = _second_difference(image.values, 1) / (sx * sx) / w
+    dyy = _second_difference(image.values, 0) / (sy * sy) / w
+    dxy = _slope(dx, 0) / sy / w
+    size = _size(dxx, dyy, dxy)
+    dx, dy, flat, dxx, dyy, dxy = dx / w, dy / w, 1 / w, dxx / size, dyy / size, dxy / size
+    mean = ((flat * flat + dy * dy) * dxx - 2 * dx * dy * dxy + (flat * flat + dx * dx) * dyy) / 2
+    gaussian = (dxx * dyy - dxy * dxy) * (flat * flat)
     # H^2 - K is never negative, but rounding can make it so: clipped at zero.
-    mean = ((1 + dy * dy) * dxx - 2 * dx * dy * dxy + (1 + dx * dx) * dyy) / (2 * area * jnp.sqrt(area))
-    gaussian = (dxx * dyy - dxy * dxy) / (area * area)
-    half_gap = _guarded_sqrt(mean * mean - gaussian)
+    mean, half_gap = size * mean, size * _guarded_sqrt(mean * mean - gaussian)
     return mean + half_gap, mean - half_gap
 
 
@@ -141,6 +145,8 @@ def adaptation(
     """
     observed = smooth(image.with_values(observation(image)), sigma, radius)
     values = observed.values
+    # Halved, the range of any numbers fits their type.
+    values = values / 2
     low = jnp.minimum(jnp.min(values), 0)
     extent = jnp.max(values) - low
     # NaN is not "nothing to see": compare so that it passes through.
@@ -169,8 +175,16 @@ def _second_difference(values: Array, axis: int) -> Array:
 
 
 def _norm(x: Array, y: Array) -> Array:
-    """sqrt(x^2 + y^2), with derivative zero at zero."""
-    return _guarded_sqrt(x * x + y * y)
+    """sqrt(x^2 + y^2), with derivative zero at zero; of numbers whose squares would leave the range of their type as well."""
+    size = _size(x, y)
+    x, y = x / size, y / size
+    return size * _guarded_sqrt(x * x + y * y)
+
+
+def _size(*parts: Array) -> Array:
+    """The largest absolute value among the parts, 1 where all are zero. What is divided and multiplied by it has no derivative from it."""
+    size = functools.reduce(jnp.maximum, [jnp.abs(lax.stop_gradient(part)) for part in parts])
+    return jnp.where(size == 0, 1, size)
 
 
 def _guarded_sqrt(square: Array) -> Array:

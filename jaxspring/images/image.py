@@ -17,6 +17,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array
@@ -74,7 +75,7 @@ class Image(eqx.Module):
 
     def normalised(self) -> Image:
         """Pixels scaled to [0, 1] by their whole range; a constant image becomes 0."""
-        values = self.values / 2  # so that the range of any numbers fits their type
+        values = of_order_one(self.values)
         low, high = jnp.min(values), jnp.max(values)
         extent = jnp.where(high > low, high - low, 1)
         return self.with_values((values - low) / extent)
@@ -94,6 +95,14 @@ class Image(eqx.Module):
     def outside(self, x: ArrayLike, y: ArrayLike) -> Array:
         """Which points lie outside the outermost pixels, as booleans of the points' shape; see `Surface.outside`."""
         return self.surface().outside(x, y)
+
+
+def of_order_one(values: Array) -> Array:
+    """Values divided by the largest, so that neither their range nor the square of it leaves their type. For what no unit can change."""
+    # In two steps, since the reciprocal of the largest float32 is no normal number. The divisor counts as a constant: it cancels later.
+    values = values / 16
+    size = jnp.max(jnp.abs(lax.stop_gradient(values)))
+    return values / jnp.where(size == 0, 1, size)
 
 
 def _per_axis(name: str, value: PerAxis, dtype: jnp.dtype, must_be_positive: bool = False) -> tuple[Array, Array]:

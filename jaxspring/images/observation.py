@@ -24,7 +24,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
-from .image import Image
+from .image import Image, of_order_one
 from .smoothing import Length, smooth
 
 # One program instead of a dozen where a function is called outside `jit`; inside, it leaves no trace.
@@ -51,13 +51,15 @@ def principal_curvatures(image: Image) -> tuple[Array, Array]:
     """
     dx, dy = image_gradient(image)
     sx, sy = image.spacing
-    # Divided by the area factor w = sqrt(1 + dx^2 + dy^2) and by their own size, so that no square leaves the range of float32.
-    w = _norm(jnp.ones_like(dx), _norm(dx, dy))
-    dxx = _second_difference(image.values, 1) / (sx * sx) / w
-    dyy = _second_difference(image.values, 0) / (sy * sy) / w
-    dxy = _slope(dx, 0) / sy / w
-    size = _size(dxx, dyy, dxy)
-    dx, dy, flat, dxx, dyy, dxy = dx / w, dy / w, 1 / w, dxx / size, dyy / size, dxy / size
+    second = _second_difference(image.values, 1) / (sx * sx), _second_difference(image.values, 0) / (sy * sy), _slope(dx, 0) / sy
+    # Slopes by the area factor A = sqrt(1 + dx^2 + dy^2), second derivatives by A and by their size: no square leaves the range of float32.
+    steep = _size(jnp.ones_like(dx), dx, dy)
+    dx, dy, flat = dx / steep, dy / steep, 1 / steep
+    area = jnp.sqrt(dx * dx + dy * dy + flat * flat)
+    dx, dy, flat = dx / area, dy / area, flat / area
+    second = tuple(part / steep / area for part in second)
+    size = _size(*second)
+    dxx, dyy, dxy = (part / size for part in second)
     mean = ((flat * flat + dy * dy) * dxx - 2 * dx * dy * dxy + (flat * flat + dx * dx) * dyy) / 2
     gaussian = (dxx * dyy - dxy * dxy) * (flat * flat)
     # H^2 - K is never negative, but rounding can make it so: clipped at zero.
@@ -144,9 +146,7 @@ def adaptation(
     [0. 0. 1. 1. 0. 0.]
     """
     observed = smooth(image.with_values(observation(image)), sigma, radius)
-    values = observed.values
-    # Halved, the range of any numbers fits their type.
-    values = values / 2
+    values = of_order_one(observed.values)
     low = jnp.minimum(jnp.min(values), 0)
     extent = jnp.max(values) - low
     # NaN is not "nothing to see": compare so that it passes through.

@@ -11,6 +11,7 @@ import PIL.Image
 import pytest
 import tifffile
 
+import jaxspring as js
 from jaxspring.forces.adaptive import ImageStiffness
 from jaxspring.images import (
     Channel,
@@ -443,6 +444,13 @@ def test_an_image_keeps_what_it_was_given():
 # Sizes of numbers
 
 
+@jax.jit
+@jax.grad
+def _slopes(values):
+    return jnp.sum(jnp.square(adaptation(Image(values), 0.0, radius=1).values))
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1e-30, 1e-20, 1e-5, 1e5, 1e20, 1e30])
 def test_k9_adaptation_does_not_depend_on_the_unit(scale, rng):
     """In float32 an image times 1e-30 to 1e30 gives the same adaptation, so the same springs; a constant image gives none."""
@@ -455,10 +463,22 @@ def test_k9_adaptation_does_not_depend_on_the_unit(scale, rng):
     np.testing.assert_array_equal(adaptation(Image(np.full((5, 5), scale, np.float32)), 1.0).values, 0)
     rule = ImageStiffness(image, 1.0, 10.0, 1.0)
     np.testing.assert_allclose(rule.adaptation().values, right, atol=2e-5)
-    slopes = jax.grad(lambda image: jnp.sum(adaptation(image, 1.0).values))(image).values * scale
-    np.testing.assert_allclose(slopes, jax.grad(lambda image: jnp.sum(adaptation(image, 1.0).values))(Image(pixels)).values, atol=1e-3)
+    np.testing.assert_allclose(_slopes(image.values) * scale, _slopes(Image(pixels).values), atol=1e-3)
 
 
+@jax.jit
+@jax.grad
+def _steepness(values):
+    return jnp.sum(gradient_magnitude(Image(values)))
+
+
+@jax.jit
+@jax.grad
+def _curvedness(values):
+    return jnp.sum(principal_curvatures(Image(values))[0])
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1e-30, 1e-20, 1.0, 1e20, 1e30])
 def test_k9_observations_against_float64(scale, rng):
     """Gradient magnitude and both curvatures in float32, for heights of 1e-30 to 1e30, are those in float64."""
@@ -467,6 +487,9 @@ def test_k9_observations_against_float64(scale, rng):
     np.testing.assert_allclose(gradient_magnitude(small), gradient_magnitude(exact), rtol=1e-5)
     for found, right in zip(principal_curvatures(small), principal_curvatures(exact), strict=True):
         np.testing.assert_allclose(found, right, rtol=1e-4, atol=2e-6 * float(np.abs(right).max()))
+    for find in (_steepness, _curvedness):
+        right = find(exact.values)
+        np.testing.assert_allclose(find(small.values), right, rtol=1e-4, atol=1e-4 * float(np.abs(right).max()))
     seen = adaptation(small, 1.0, Combined((GradientMagnitude(), Curvature()), (1.0, 1.0))).values
     assert 0 <= seen.min() <= seen.max() == 1
 
@@ -475,3 +498,27 @@ def test_k9_the_whole_range_of_float32():
     """From the lowest to the highest number the range overflows: it is halved first, not called infinite and everything 0."""
     image = Image(np.array([[-3e38, 0.0], [3e38, 3e38]], np.float32))
     np.testing.assert_allclose(image.normalised().values, [[0, 0.5], [1, 1]])
+
+
+# Spacing that cannot be looked at
+
+
+@pytest.mark.slow
+def test_a_traced_spacing_of_zero_is_no_place():
+    """Traced, a spacing of 0 gives NaN instead of a border pixel, and a run over such an image ends with INVALID."""
+    pixels = np.arange(12.0).reshape(3, 4)
+    read = jax.jit(lambda spacing: Image(pixels, spacing).sample_with_gradient(1.0, 2.0))
+    assert all(np.isnan(part) for part in read(0.0))
+    assert read(1.0)[0] == 9
+    net = js.Graph.from_edges([[0, 1]], 2)
+    start = js.State.from_points(net, [[0.0, 0.0, 0.0], [1.0, 1.0, 0.0]])
+
+    @jax.jit
+    def run(spacing):
+        image = Image(pixels, spacing)
+        rule = js.Springs(net, ImageStiffness(image, 1.0, 2.0, 0.0, radius=0), 1.0)
+        effects = (js.DataSprings(image, 1.0), js.ImageAttraction(image, 1.0), rule)
+        return [js.rollout(js.System(net, 1.0, (effect,)), start, js.SymplecticEuler(), 0.01, 1).status for effect in effects]
+
+    assert all(bool(status.has(js.Flag.INVALID)) for status in run(0.0))
+    assert all(bool(status.is_ok) for status in run(1.0))

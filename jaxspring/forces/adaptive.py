@@ -29,7 +29,7 @@ from ..numerics import cast_inexact
 from ..state import State
 from ..topology.base import Topology
 from ..topology.edge_field import EdgeField
-from .base import any_refused
+from .base import any_not_positive, any_refused
 from .springs import StiffnessRule
 
 
@@ -108,8 +108,8 @@ class ImageStiffness(StiffnessRule):
         return self.k_max
 
     def invalid(self) -> Array:
-        """Whether a constant is negative or not finite, or k_min is above k_max."""
-        return any_refused(self.k_min, self.k_max, self.sigma) | (self.k_min > self.k_max)
+        """Whether a constant is negative or not finite, k_min is above k_max, or the image's spacing is not positive."""
+        return any_refused(self.k_min, self.k_max, self.sigma) | (self.k_min > self.k_max) | any_not_positive(self.image.spacing)
 
 
 __all__ = ["ImageStiffness"]

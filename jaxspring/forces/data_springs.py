@@ -16,7 +16,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._checks import as_inexact, nonnegative
+from .._checks import as_inexact, finite, nonnegative
 from ..images.image import Image
 from ..images.sampling import Bilinear
 from ..images.surface import Surface
@@ -25,7 +25,7 @@ from ..numerics import cast_inexact
 from ..state import State
 from ..status import Flag
 from ..vector import Vector
-from .base import Finding, Force, any_refused
+from .base import Finding, Force, any_not_positive, any_refused
 from .linearisation import Linearisation
 
 
@@ -96,8 +96,8 @@ class DataSprings(Force):
         return _outside(_surface(self), state)
 
     def invalid(self) -> Array:
-        """Whether the stiffness is negative or not finite."""
-        return any_refused(self.stiffness)
+        """Whether the stiffness is negative or not finite, or the image's spacing not positive."""
+        return any_refused(self.stiffness) | any_not_positive(self.image.spacing)
 
 
 class ImageAttraction(Force):
@@ -116,6 +116,7 @@ class ImageAttraction(Force):
     def __init__(self, image: Image, strength: Any, sampling: Any = None):
         self.image = image
         self.strength = as_inexact("strength", strength)
+        finite("strength", self.strength)
         self.sampling = Bilinear() if sampling is None else sampling
 
     def prepare(self, dtype: Any) -> ImageAttraction:
@@ -135,6 +136,10 @@ class ImageAttraction(Force):
     def diagnose(self, state: State) -> tuple[Finding, ...]:
         """OUTSIDE: nodes beyond the image's border."""
         return _outside(_surface(self), state)
+
+    def invalid(self) -> Array:
+        """Whether the strength is not finite, or the image's spacing not positive."""
+        return ~jnp.all(jnp.isfinite(self.strength)) | any_not_positive(self.image.spacing)
 
 
 def _surface(effect: DataSprings | ImageAttraction) -> Surface:

@@ -1,4 +1,4 @@
-"""Loading images: PNG, JPEG and TIFF through Pillow, NumPy `.npy` and `.npz` files, plain arrays, and the elevation model of matplotlib.
+"""Loading images: PNG and JPEG through Pillow, TIFF through tifffile, NumPy's files and arrays, and the elevation model of matplotlib.
 
 Files are not trusted. The kind is read from the first bytes, not from the name; the size that a header claims is checked before anything is
 decoded or allocated; arrays are never unpickled. Whatever is wrong with a file is one `ImageError` with one line.
@@ -11,15 +11,19 @@ import stat
 import warnings
 from typing import Any
 
-import equinox as eqx
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from jax.core import Tracer
+from numpy.typing import ArrayLike
 
+from .channels import Channel, Luminance, Pixels
 from .image import Image, PerAxis
 from .numpy_files import read_npy, read_npz
+from .tiff_files import MAGIC, read_tiff
 
 MAX_PIXELS = 64_000_000
 """Largest image that is loaded unless told otherwise: 64 million pixels are 0.5 GB in float64."""
+
+_PNG_HEAD = 26  # bytes up to the bits per channel and the kind of colour
 
 
 class ImageError(ValueError):
@@ -27,30 +31,6 @@ class ImageError(ValueError):
 
     The message is one line that names the file, what is wrong and what to do.
     """
-
-
-class Channel(eqx.Module):
-    """Take one channel of a colour image by its index: 0, 1, 2 are red, green, blue; of two channels, 0 is grey and 1 is opacity."""
-
-    index: int = eqx.field(static=True)
-
-    def __call__(self, pixels: NDArray[Any]) -> NDArray[Any]:
-        """From `(ny, nx, n_channels)` to `(ny, nx)`."""
-        n_channels = pixels.shape[-1]
-        if not -n_channels <= self.index < n_channels:
-            raise ValueError(f"Channel({self.index}) does not exist: shape {pixels.shape} has channels 0 to {n_channels - 1}.")
-        return pixels[..., self.index]
-
-
-class Luminance(eqx.Module):
-    """Grey from colour by the weights 0.299, 0.587, 0.114 of red, green, blue (ITU-R BT.601, on the stored values). Opacity is ignored."""
-
-    def __call__(self, pixels: NDArray[Any]) -> NDArray[Any]:
-        """From `(ny, nx, n_channels)` to `(ny, nx)`, in the range of the channels."""
-        if pixels.shape[-1] < 3:
-            return pixels[..., 0]
-        dtype = pixels.dtype if pixels.dtype.kind == "f" else np.float64
-        return pixels[..., :3] @ np.array([0.299, 0.587, 0.114], dtype)
 
 
 def image_from_array(
@@ -63,18 +43,17 @@ def image_from_array(
 ) -> Image:
     """An `Image` from a NumPy array `(ny, nx)`, or `(ny, nx, n_channels)` with a `channel` that says which grey to take.
 
-    `fill` replaces pixels that are NaN or infinite; without it they are an error. `spacing` and `origin` [m] and errors as in `Image`.
+    `fill` replaces pixels that are masked (in a masked array), NaN or infinite; without it they are an error. `spacing`, `origin` [m] and
+    errors as in `Image`.
 
     >>> import numpy as np
     >>> print(image_from_array(np.ones((2, 2, 3)), Luminance()).values[0])
     [1. 1.]
     """
-    array = np.asarray(pixels)
-    if channel is not None and array.ndim == 3 and array.shape[-1] in (1, 2, 3, 4):
-        array = channel(array)
-    if fill is not None and array.dtype.kind == "f":
-        array = np.where(np.isfinite(array), array, np.asarray(fill, array.dtype))
-    return Image(array, spacing, origin)
+    if isinstance(pixels, Tracer):
+        raise TypeError("pixels are traced, so that they cannot be looked at: build Image(values) inside jit and grad.")
+    mask = np.ma.getmaskarray(pixels) if isinstance(pixels, np.ma.MaskedArray) else None
+    return Image(Pixels(np.asarray(pixels), mask=mask).one_channel(channel, fill), spacing, origin)
 
 
 def load_image(
@@ -82,32 +61,38 @@ def load_image(
     channel: Channel | Luminance | None = None,
     *,
     array: str | None = None,
+    page: int | None = None,
     spacing: PerAxis = 1.0,
     origin: PerAxis = 0.0,
     fill: float | None = None,
     max_pixels: int = MAX_PIXELS,
 ) -> Image:
-    """An `Image` from a PNG, JPEG or TIFF file (needs Pillow) or from a NumPy `.npy` or `.npz` file.
+    """An `Image` from a PNG, JPEG or TIFF file (needs the extra `viz`) or from a NumPy `.npy` or `.npz` file.
 
-    Pixels keep their stored range (0 to 255, or 0 to 65535 for 16 bits); row 0 is the top row. A photograph is turned upright as its EXIF
-    tag says; of several pages the first is taken. A colour file is an error unless `channel` says how to make it grey.
+    Pixels keep their stored range (0 to 255, 0 to 15 for 4 bits, 0 to 65535 for 16); row 0 is the top row. A picture is turned upright as
+    its tag says. Where a TIFF stores darkness (zero is white), brightness is taken. Colour is an error unless `channel` says how to make it
+    grey; no colour profile and no gamma is applied, and inks (CMYK) become RGB without a profile.
+
+    A pixel has no value where the file declares it as no-data (GDAL's tag), masks it, or makes it transparent: that is an error, or `fill`
+    stands there. A half transparent pixel is mixed with `fill` as with a background.
 
     Args:
         path: the file.
         channel: `Luminance()`, `Channel(index)`, or None for files of one channel.
         array: which array of an `.npz` file; may be left out where there is only one.
+        page: which page of a TIFF, or frame of an animated PNG, from 0; may be left out where there is only one.
         spacing: distance between pixels [m], as in `Image`.
         origin: position of the first pixel [m], as in `Image`.
-        fill: number to put where a pixel is NaN or infinite; without it such a file is refused.
+        fill: number to put where a pixel has no value, is NaN or infinite; without it such a file is refused.
         max_pixels: larger images are refused before they are decoded.
 
     Raises:
         ImageError: the file cannot be used; one line says why.
-        ImportError: it is not a NumPy file, and Pillow is not installed.
+        ImportError: it is not a NumPy file, and Pillow (or tifffile, for TIFF) is not installed.
     """
     try:
-        pixels = _read_pixels(os.fspath(path), array, max_pixels)
-        return image_from_array(pixels, channel, spacing=spacing, origin=origin, fill=fill)
+        pixels = _read_pixels(os.fspath(path), array, page, max_pixels)
+        return Image(pixels.one_channel(channel, fill), spacing, origin)
     except ImportError:
         raise
     except OSError as error:
@@ -135,8 +120,8 @@ def elevation_model(spacing: PerAxis = 1.0) -> Image:
     return load_image(cbook.get_sample_data("jacksboro_fault_dem.npz", asfileobj=False), array="elevation", spacing=spacing)
 
 
-def _read_pixels(path: str, array: str | None, max_pixels: int) -> NDArray[Any]:
-    """Pixels of a file as an array of two or three axes. Raises whatever the decoder raises."""
+def _read_pixels(path: str, array: str | None, page: int | None, max_pixels: int) -> Pixels:
+    """Pixels of a file as they are stored. Raises whatever the decoder raises."""
     if not stat.S_ISREG(os.stat(path).st_mode):
         raise ValueError("it is not a file; pass the path of an image file.")
     with open(path, "rb") as stream:
@@ -145,38 +130,72 @@ def _read_pixels(path: str, array: str | None, max_pixels: int) -> NDArray[Any]:
         if not start:
             raise ValueError("the file is empty; write the image again.")
         if start.startswith(b"PK"):
-            return read_npz(stream, array, max_pixels)
+            return Pixels(read_npz(stream, array, max_pixels))
         if start.startswith(b"\x93NUMPY"):
-            return read_npy(stream, os.fstat(stream.fileno()).st_size, max_pixels)
-        return _read_with_pillow(stream, max_pixels)
+            return Pixels(read_npy(stream, os.fstat(stream.fileno()).st_size, max_pixels))
+        if start.startswith(MAGIC):
+            return read_tiff(stream, page, max_pixels)
+        return _read_with_pillow(stream, page, max_pixels)
 
 
-def _read_with_pillow(stream: Any, max_pixels: int) -> NDArray[Any]:
-    """Decode PNG, JPEG or TIFF, after the size in the header has been checked."""
+def _read_with_pillow(stream: Any, page: int | None, max_pixels: int) -> Pixels:
+    """Decode PNG or JPEG, after the size in the header has been checked."""
     try:
         import PIL.Image
-        import PIL.ImageOps
     except ImportError as error:
         raise ImportError("Reading PNG, JPEG and TIFF needs Pillow: pip install jaxspring[viz]") from error
+    head = stream.read(_PNG_HEAD)
+    stream.seek(0)
     with warnings.catch_warnings():
         # Pillow only warns of a large image; here it is an error below. Its other warnings are of tags that do not touch the pixels.
         warnings.simplefilter("ignore")
         try:
-            picture = PIL.Image.open(stream, formats=("PNG", "JPEG", "TIFF"))
+            picture = PIL.Image.open(stream, formats=("PNG", "JPEG"))
         except PIL.UnidentifiedImageError:
-            raise ValueError("it is damaged, or not an image; pass a PNG, JPEG, TIFF, .npy or .npz file.") from None
+            raise ValueError("it is damaged, not an image, or of another kind; pass a PNG, JPEG, TIFF, .npy or .npz file.") from None
         except PIL.Image.DecompressionBombError as error:
             raise ValueError(f"it is too large: {error} Make the image smaller.") from None
         with picture:
             width, height = picture.size
             if width * height > max_pixels:
                 raise ValueError(f"{width} x {height} pixels exceed max_pixels = {max_pixels}; make the image smaller or raise max_pixels.")
+            bits, colour = (head[24], head[25]) if picture.format == "PNG" else (8, 0)
+            if bits == 16 and colour:
+                raise ValueError("it has several channels of 16 bits, which Pillow cuts to 8; save it as TIFF, or with 8 bits.")
+            _choose_frame(picture, page)
             try:
-                picture.load()
-                if picture.mode in ("P", "PA"):
-                    picture = picture.convert("RGBA" if "transparency" in picture.info or picture.mode == "PA" else "RGB")
-                elif picture.mode in ("CMYK", "YCbCr", "HSV"):
-                    picture = picture.convert("RGB")
-                return np.array(PIL.ImageOps.exif_transpose(picture))
+                return _decoded(picture, bits)
             except Exception as error:
                 raise ValueError(f"the file is damaged or cut short ({error}); fetch or write it again.") from None
+
+
+def _choose_frame(picture: Any, page: int | None) -> None:
+    """Go to a frame. The further pictures of a photograph (its preview, its depth) are not meant unless asked for."""
+    count = getattr(picture, "n_frames", 1)
+    if page is None and count > 1 and picture.format == "PNG":
+        raise ValueError(f"it is animated, with {count} frames; pass page=<0 to {count - 1}>.")
+    if not -count <= (page or 0) < count:
+        raise ValueError(f"there is no page {page}; it holds {count}.")
+    if page:
+        picture.seek(page % count)
+
+
+def _decoded(picture: Any, bits: int) -> Pixels:
+    """The pixels of an opened picture, upright, with their opacity."""
+    import PIL.ImageOps
+
+    picture.load()
+    through = picture.info.get("transparency")
+    if picture.mode in ("P", "PA") or (picture.mode == "RGB" and through is not None):
+        picture = picture.convert("RGB" if through is None and picture.mode == "P" else "RGBA")
+        through = None
+    elif picture.mode in ("CMYK", "YCbCr", "HSV"):
+        picture = picture.convert("RGB")
+    if picture.mode == "1" and through is not None:
+        through = through > 0  # Pillow says 255 for 1
+    values = np.array(PIL.ImageOps.exif_transpose(picture))
+    if bits in (2, 4) and values.ndim == 2:  # Pillow spreads them over 8 bits
+        values = values // (255 // (2**bits - 1))
+    alpha = values.shape[-1] - 1 if values.ndim == 3 and picture.mode in ("RGBA", "LA") else None
+    is_hidden = None if through is None or values.ndim == 3 else values == through
+    return Pixels(values, mask=is_hidden, alpha=alpha)

@@ -14,8 +14,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array
@@ -74,9 +76,10 @@ class Image(eqx.Module):
 
     def normalised(self) -> Image:
         """Pixels scaled to [0, 1] by their whole range; a constant image becomes 0."""
-        low, high = jnp.min(self.values), jnp.max(self.values)
+        values = of_order_one(self.values)
+        low, high = jnp.min(values), jnp.max(values)
         extent = jnp.where(high > low, high - low, 1)
-        return self.with_values((self.values - low) / extent)
+        return self.with_values((values - low) / extent)
 
     def surface(self, method: Sampling = Bilinear()) -> Surface:  # noqa: B008 (frozen, holds no array)
         """The image made ready to be read between its pixels. Make it once, outside a loop: `CubicSpline` filters the pixels here."""
@@ -95,6 +98,14 @@ class Image(eqx.Module):
         return self.surface().outside(x, y)
 
 
+def of_order_one(values: Array) -> Array:
+    """Values divided by the largest, so that neither their range nor the square of it leaves their type. For what no unit can change."""
+    # In two steps, since the reciprocal of the largest float32 is no normal number. The divisor counts as a constant: it cancels later.
+    values = values / 16
+    size = jnp.max(jnp.abs(lax.stop_gradient(values)))
+    return values / jnp.where(size == 0, 1, size)
+
+
 def _per_axis(name: str, value: PerAxis, dtype: jnp.dtype, must_be_positive: bool = False) -> tuple[Array, Array]:
     """A number, or a pair (x, y), as two scalar arrays of the pixels' type."""
     given: Any = value
@@ -110,6 +121,9 @@ def _per_axis(name: str, value: PerAxis, dtype: jnp.dtype, must_be_positive: boo
 
 def _as_pixels(values: ArrayLike) -> Array:
     """Pixels as a floating array; refuse what is not one channel of finite real numbers, naming what came and what to do."""
+    if isinstance(values, np.ma.MaskedArray) and np.ma.getmaskarray(values).any():
+        row = tuple(int(i) for i in np.argwhere(np.ma.getmaskarray(values))[0])
+        raise ValueError(f"values{list(row)} is masked: what lies under a mask is no pixel. Use image_from_array(values, fill=<number>).")
     array: Any = given("values", values)
     if not isinstance(array, Tracer):
         array = np.asarray(array)

@@ -20,11 +20,13 @@ from collections.abc import Callable, Sequence
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from .._arrays import own
 from .image import Image
+from .image import Image, of_order_one
 from .smoothing import Length, smooth
 
 # One program instead of a dozen where a function is called outside `jit`; inside, it leaves no trace.
@@ -51,14 +53,19 @@ def principal_curvatures(image: Image) -> tuple[Array, Array]:
     """
     dx, dy = image_gradient(image)
     sx, sy = image.spacing
-    dxx = _second_difference(image.values, 1) / (sx * sx)
-    dyy = _second_difference(image.values, 0) / (sy * sy)
-    dxy = _slope(dx, 0) / sy
-    area = 1 + dx * dx + dy * dy
+    second = _second_difference(image.values, 1) / (sx * sx), _second_difference(image.values, 0) / (sy * sy), _slope(dx, 0) / sy
+    # Slopes by the area factor A = sqrt(1 + dx^2 + dy^2), second derivatives by A and by their size: no square leaves the range of float32.
+    steep = _size(jnp.ones_like(dx), dx, dy)
+    dx, dy, flat = dx / steep, dy / steep, 1 / steep
+    area = jnp.sqrt(dx * dx + dy * dy + flat * flat)
+    dx, dy, flat = dx / area, dy / area, flat / area
+    second = tuple(part / steep / area for part in second)
+    size = _size(*second)
+    dxx, dyy, dxy = (part / size for part in second)
+    mean = ((flat * flat + dy * dy) * dxx - 2 * dx * dy * dxy + (flat * flat + dx * dx) * dyy) / 2
+    gaussian = (dxx * dyy - dxy * dxy) * (flat * flat)
     # H^2 - K is never negative, but rounding can make it so: clipped at zero.
-    mean = ((1 + dy * dy) * dxx - 2 * dx * dy * dxy + (1 + dx * dx) * dyy) / (2 * area * jnp.sqrt(area))
-    gaussian = (dxx * dyy - dxy * dxy) / (area * area)
-    half_gap = _guarded_sqrt(mean * mean - gaussian)
+    mean, half_gap = size * mean, size * _guarded_sqrt(mean * mean - gaussian)
     return mean + half_gap, mean - half_gap
 
 
@@ -141,7 +148,7 @@ def adaptation(
     [0. 0. 1. 1. 0. 0.]
     """
     observed = smooth(image.with_values(observation(image)), sigma, radius)
-    values = observed.values
+    values = of_order_one(observed.values)
     low = jnp.minimum(jnp.min(values), 0)
     extent = jnp.max(values) - low
     # NaN is not "nothing to see": compare so that it passes through.
@@ -170,8 +177,16 @@ def _second_difference(values: Array, axis: int) -> Array:
 
 
 def _norm(x: Array, y: Array) -> Array:
-    """sqrt(x^2 + y^2), with derivative zero at zero."""
-    return _guarded_sqrt(x * x + y * y)
+    """sqrt(x^2 + y^2), with derivative zero at zero; of numbers whose squares would leave the range of their type as well."""
+    size = _size(x, y)
+    x, y = x / size, y / size
+    return size * _guarded_sqrt(x * x + y * y)
+
+
+def _size(*parts: Array) -> Array:
+    """The largest absolute value among the parts, 1 where all are zero. What is divided and multiplied by it has no derivative from it."""
+    size = functools.reduce(jnp.maximum, [jnp.abs(lax.stop_gradient(part)) for part in parts])
+    return jnp.where(size == 0, 1, size)
 
 
 def _guarded_sqrt(square: Array) -> Array:

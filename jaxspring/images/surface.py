@@ -26,7 +26,8 @@ class Surface(eqx.Module):
     """An image with its coefficients for one way of sampling, from `Image.surface`.
 
     The result has the floating type of the points, not of the pixels, so a float32 state stays float32. A coordinate that is NaN or
-    infinite gives NaN, and so does a traced spacing that is not positive or an origin that is not finite; any other coordinate outside is clamped, however far.
+    infinite gives NaN, and so does everything where a traced spacing is not positive or an origin not finite; any other coordinate outside is clamped, however
+    far.
     """
 
     coefficients: Array
@@ -68,7 +69,7 @@ class Surface(eqx.Module):
         return ~(column.inside & row.inside)
 
     def _locate(self, x: ArrayLike, y: ArrayLike) -> tuple[tuple[_Along, _Along], Array]:
-        """The cell and the fraction of it that each coordinate falls in, and whether both coordinates are finite."""
+        """The cell and the fraction of it that each coordinate falls in, and whether that is a place."""
         x, y = _points(x, y)
         column = _along(x, self.origin[0], self.spacing[0], self.shape[1])
         row = _along(y, self.origin[1], self.spacing[1], self.shape[0])

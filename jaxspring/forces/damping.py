@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from .._checks import as_inexact, nonnegative
+from .._checks import node_values, nonnegative
 from ..linalg.operators import Blocks, SpringBlocks, isotropic
 from ..numerics import cast_inexact, tiny
 from ..state import State
@@ -39,7 +39,7 @@ class Drag(Force):
     gamma: Array
 
     def __init__(self, gamma: Any):
-        self.gamma = as_inexact("gamma", gamma)
+        self.gamma = node_values("gamma", gamma)
         nonnegative("gamma", self.gamma, "A negative drag feeds energy in.")
 
     def force(self, state: State) -> Vector:

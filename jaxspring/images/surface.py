@@ -26,7 +26,7 @@ class Surface(eqx.Module):
     """An image with its coefficients for one way of sampling, from `Image.surface`.
 
     The result has the floating type of the points, not of the pixels, so a float32 state stays float32. A coordinate that is NaN or
-    infinite gives NaN, and so does a traced spacing that is not positive or an origin that is not finite; any other coordinate outside is clamped, however far.
+    infinite gives NaN; any other coordinate outside is clamped, however far.
     """
 
     coefficients: Array
@@ -72,9 +72,7 @@ class Surface(eqx.Module):
         x, y = _points(x, y)
         column = _along(x, self.origin[0], self.spacing[0], self.shape[1])
         row = _along(y, self.origin[1], self.spacing[1], self.shape[0])
-        # A spacing or origin that is none, where its constructor could not look at it: NaN, not a pixel of the border.
-        is_sound = jnp.stack([(s > 0) & jnp.isfinite(s) & jnp.isfinite(o) for s, o in zip(self.spacing, self.origin, strict=True)])
-        return (column, row), jnp.isfinite(x) & jnp.isfinite(y) & jnp.all(is_sound)
+        return (column, row), jnp.isfinite(x) & jnp.isfinite(y)
 
     def _block(self, column: _Along, row: _Along) -> list[list[Array]]:
         """The coefficients around each point, as `block[a][b]` along rows and columns."""

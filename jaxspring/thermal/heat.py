@@ -19,7 +19,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from .._checks import as_inexact, finite, has_shape, nonnegative, positive
+from .._checks import as_inexact, finite, nonnegative, positive
 from ..forces.base import Rule, any_refused
 from ..linalg.operators import SpringBlocks
 from ..numerics import cast_inexact, is_traced, stopped

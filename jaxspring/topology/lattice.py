@@ -182,7 +182,9 @@ class Lattice(Topology):
         found: dict[Offset, Any] = {}
         for springs, number in value.items():
             if not isinstance(springs, SpringFamilies):
-                raise TypeError(f"{name} has the key {springs!r:.60}; expected families of springs, e.g. {{STRUCTURAL: 100.0, SHEAR: 50.0}}.")
+                raise TypeError(
+                    f"{name} has the key {springs!r:.60}; expected families of springs, e.g. {{STRUCTURAL: 100.0, SHEAR: 50.0}}."
+                )
             offsets = springs.offsets(len(self.shape))
             if not set(offsets) & set(self.offsets):
                 raise ValueError(f"{name} names {springs}, but this lattice has no such springs. Leave {springs} out.")

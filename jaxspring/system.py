@@ -286,10 +286,10 @@ def lumped_mass(net: Topology, points: Any, density: Any, triangles: Any = None)
         density: one number.
         triangles: (T, 3) node numbers, or None for a density along springs.
     """
-    density = as_inexact("density", density)
+    points = as_inexact("points", points)
+    density = as_inexact("density", density, points.dtype)
     has_shape("density", density, {"one number": ()})
     positive("density", density, "A node without mass would get an infinite acceleration.")
-    points = as_inexact("points", points)
     if points.ndim != 2 or points.shape[0] != net.n_nodes:
         raise ValueError(f"points has shape {points.shape}; expected ({net.n_nodes}, D).")
     finite("points", points)

@@ -80,7 +80,7 @@ class Dashpots(Force):
 
     Attributes:
         net: the topology.
-        damping: c [N s/m]: a number, (E,) in the user's order, or an `EdgeField`.
+        damping: c [N s/m]: a number, (E,) in the user's order, an `EdgeField`, or numbers by family, as in `Springs`.
     """
 
     net: Topology

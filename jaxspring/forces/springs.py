@@ -70,8 +70,9 @@ class Springs(Force):
 
     Attributes:
         net: the topology.
-        stiffness: k [N/m]: a number, (E,) in the user's order, an `EdgeField`, or a `StiffnessRule`.
-        rest_length: l [m]: a number, (E,) or an `EdgeField`.
+        stiffness: k [N/m]: a number, (E,) in the user's order, an `EdgeField`, or a `StiffnessRule`; on a lattice also numbers by family,
+            `{js.STRUCTURAL: 100.0, js.SHEAR: 20.0}`.
+        rest_length: l [m]: as the stiffness.
         law: the law of one spring; `Hooke()` unless said.
         axes: the coordinates the springs act in (None: all). `axes=(0, 1)` makes springs of the projection on the plane.
         allow_negative_stiffness: accept stiffnesses below zero, which push without bound.

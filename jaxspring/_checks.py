@@ -173,6 +173,16 @@ def node_values(name: str, value: Any) -> Array:
     return value
 
 
+def fits_nodes(name: str, value: Array, state: Any) -> Array:
+    """`value`, which must be one number or an array in the node shape of `state`: other shapes would be stretched over the nodes.
+
+    Raises:
+        ValueError: another shape.
+    """
+    has_shape(name, value, {"one number": (), "node shape: see net.node_field": tuple(state.position.shape)})
+    return value
+
+
 def _first(bad: np.ndarray, numbers: np.ndarray) -> tuple[str, str]:
     index = tuple(int(i) for i in np.argwhere(bad)[0])
     where = "" if not index else "[" + ", ".join(map(str, index)) + "]"

@@ -103,6 +103,9 @@ class System(eqx.Module):
         self.rules = tuple(self._adopt_rule(i, r) for i, r in enumerate(rules if isinstance(rules, Iterable) else (rules,))) or None
         self.free = _as_free(net, free)
         self.motion = motion
+        if motion is not None:
+            moved = as_mask("motion.moved", motion.moved, ", True where a node follows the schedule")
+            has_shape("motion.moved", moved, {"node shape": net.node_shape})
 
     def _cast(self, effect: Force, state: State) -> Force:
         """The effect in its system, and constants of the state's dtype: float32 in, float32 out, whatever the constants were."""

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from .._checks import node_values, nonnegative
+from .._checks import fits_nodes, node_values, nonnegative
 from ..linalg.operators import Blocks, SpringBlocks, isotropic
 from ..numerics import cast_inexact, tiny
 from ..state import State
@@ -44,7 +44,7 @@ class Drag(Force):
 
     def force(self, state: State) -> Vector:
         """-gamma v [N]."""
-        return -(self.gamma * state.velocity)
+        return -(fits_nodes("gamma", self.gamma, state) * state.velocity)
 
     def damping_blocks(self, state: State) -> Blocks:
         """Gamma on the diagonal [N s/m]."""

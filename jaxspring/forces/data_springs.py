@@ -16,7 +16,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._checks import as_inexact, finite, has_shape, node_values, nonnegative
+from .._checks import as_inexact, finite, fits_nodes, has_shape, node_values, nonnegative
 from ..images.image import Image
 from ..images.sampling import Bilinear
 from ..images.surface import Surface
@@ -58,6 +58,7 @@ class DataSprings(Force):
     def force(self, state: State) -> Vector:
         """Pull toward the image [N]."""
         x, y, z = _coordinates(state)
+        fits_nodes("stiffness", self.stiffness, state)
         if not self.conservative:
             zero = jnp.zeros_like(z)
             return Vector((zero, zero, self.stiffness * (_surface(self).value(x, y) - z)))

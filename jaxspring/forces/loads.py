@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._checks import as_inexact, finite, node_values, shape_of
+from .._checks import as_inexact, finite, fits_nodes, node_values, shape_of
 from ..state import State
 from ..topology.base import Topology
 from ..vector import Vector
@@ -41,6 +41,7 @@ class Gravity(Force):
 
     def force(self, state: State) -> Vector:
         """Weight m g [N]."""
+        fits_nodes("mass", self._mass(), state)
         return Vector(tuple(self._weight(g, a) for g, a in zip(self._acceleration(state), state.position, strict=True)))
 
     def energy(self, state: State) -> Array:

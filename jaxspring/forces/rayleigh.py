@@ -20,7 +20,7 @@ from typing import Any
 import equinox as eqx
 from jaxtyping import Array
 
-from .._checks import as_inexact, node_values, nonnegative
+from .._checks import as_inexact, fits_nodes, node_values, nonnegative
 from ..linalg.operators import Blocks, isotropic
 from ..numerics import cast_inexact
 from ..state import State
@@ -109,6 +109,7 @@ class Rayleigh(Force):
     def damping_blocks(self, state: State) -> Blocks:
         """Blocks of a M + b K in this state [N s/m]."""
         mass, forces = self._bound()
+        fits_nodes("mass", mass, state)
         blocks = Blocks((isotropic(self.mass_rate * mass, state.position),))
         for force in forces:
             stiffness = force.stiffness_blocks(state, Tangent())

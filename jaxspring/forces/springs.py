@@ -15,6 +15,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from .._arrays import whole_number
 from .._checks import finite, is_concrete, nonnegative, positive
 from ..linalg.operators import Blocks, SpringBlocks
 from ..numerics import cast_inexact, tiny
@@ -107,7 +108,9 @@ class Springs(Force):
         self.stiffness = stiffness if isinstance(stiffness, StiffnessRule) else _edge_constant(net, "stiffness", stiffness)
         self.rest_length = _edge_constant(net, "rest_length", rest_length)
         self.law = Hooke() if law is None else law
-        self.axes = None if axes is None else tuple(int(a) for a in axes)
+        self.axes = None if axes is None else tuple(whole_number("axes", a) for a in axes)
+        if self.axes is not None and not (self.axes and set(self.axes) <= {0, 1, 2} and len(set(self.axes)) == len(self.axes)):
+            raise ValueError(f"axes = {self.axes}; expected different coordinates out of 0 (x), 1 (y), 2 (z), e.g. (0, 1).")
         self.allow_negative_stiffness = allow_negative_stiffness
         self.expansion = expansion
         if not isinstance(stiffness, StiffnessRule):
@@ -245,6 +248,8 @@ class Springs(Force):
         return field is not None and tuple(entry.shape for entry in field.families) == self.net.family_shapes
 
     def _seen(self, state: State) -> Vector:
+        if self.axes is not None and max(self.axes) >= state.dim:
+            raise ValueError(f"axes = {self.axes}, but the positions have {state.dim} coordinates.")
         return state.position if self.axes is None else Vector(tuple(state.position[a] for a in self.axes))
 
     def _constants(self, state: State) -> tuple[Array | EdgeField, Array | EdgeField]:

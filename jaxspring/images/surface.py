@@ -16,6 +16,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
+from .._arrays import given
 from .sampling import Sampling
 
 # One program instead of a dozen where a method is called outside `jit`; inside, it leaves no trace.
@@ -117,6 +118,7 @@ def _weighted(weights: Sequence[Array], terms: Sequence[Array]) -> Array:
 def _points(x: ArrayLike, y: ArrayLike) -> tuple[Array, Array]:
     """Both coordinates as floating arrays of one shape and one type."""
     # A Python number follows the other coordinate; whole numbers become the default float.
+    x, y = given("x", x), given("y", y)
     dtype = jnp.result_type(x, y)
     if not jnp.issubdtype(dtype, jnp.floating):
         dtype = jnp.result_type(float)

@@ -93,7 +93,7 @@ class Heat(Rule):
         Args:
             net: the topology along which heat flows.
             capacity: [J/K]: a number, or (N,) in the user's order; see `capacities`.
-            conductance: [W/K]: a number, (E,) in the user's order, an edge field (see `conductances`), or numbers by family, as in `Springs`.
+            conductance: [W/K]: a number, (E,) in the user's order, an edge field (`conductances`), or numbers by family (`Springs`).
             scheme: `ExplicitHeat()` unless said.
             boundaries: one or several; where none is named the body is insulated.
             source: [W]: a number, (N,) in the user's order, or a function of time [s] that gives a number or a node array.

@@ -327,3 +327,49 @@ def test_bad_numbers_under_jit_are_a_status(bad):
 
     found = dict(zip(builds, flags(bad), strict=True))
     assert not any(found.values()), found
+
+
+def test_constants_of_nodes_fit_the_nodes():
+    """A constant of each node in another shape would be stretched over the nodes, in silence: refused by name."""
+    chain, sheet = js.State.from_points(NET, np.zeros((3, 3)), np.ones((3, 3))), js.lattice((2, 2))
+    image = js.Image(np.ones((3, 3)))
+    for force, name in (
+        (js.Drag(np.ones((3, 1))), "gamma"),
+        (js.DataSprings(image, np.ones((3, 1))), "stiffness"),
+        (js.Gravity([0.0, 0.0, 1.0], np.ones((3, 1))), "mass"),
+    ):
+        with pytest.raises(ValueError, match=rf"{name} has shape \(3, 1\); expected \(\) .*node_field"):
+            js.System(NET, 1.0, force).force(chain)
+    with pytest.raises(ValueError, match="gamma has shape"):
+        js.System(sheet, 1.0, js.Drag([1.0, 2.0])).force(js.State.from_points(sheet, sheet.grid(), np.ones((4, 2))))
+
+
+def test_moved_nodes_are_told_by_a_mask():
+    """Node numbers and masks of another length are refused; numbers moved nothing, in silence."""
+
+    def path(time):
+        return js.Vector((time * jnp.ones(3),))
+
+    for moved, error in (([0], TypeError), (np.array([True, False]), ValueError)):
+        with pytest.raises(error, match=r"motion.moved has"):
+            js.System(NET, 1.0, motion=js.Motion(moved, path))
+
+
+def test_lists_of_points_are_sampled():
+    """An image reads lists of coordinates as it reads arrays."""
+    image = js.Image(np.arange(9.0).reshape(3, 3))
+    np.testing.assert_array_equal(image.sample([0.0, 1.5], [1.0, 2.0]), image.sample(np.array([0.0, 1.5]), np.array([1.0, 2.0])))
+
+
+def test_small_doors_name_what_they_refuse():
+    """Coordinates that do not exist, times that are lists, lengths of many states: a sentence each; one number flattens to all nodes."""
+    system, state = scene()
+    with pytest.raises(ValueError, match=r"axes = \(0, 5\)"):
+        js.Springs(NET, 1.0, 1.0, axes=(0, 5))
+    with pytest.raises(ValueError, match=r"axes = \(0, 1\), but the positions have 1"):
+        js.System(NET, 1.0, js.Springs(NET, 1.0, 1.0, axes=(0, 1))).force(state)
+    with pytest.raises(ValueError, match="t1 has shape"):
+        js.diffeqsolve(system, state, [1.0])
+    with pytest.raises(ValueError, match=r"position has shape \(2, 3\).*vmap"):
+        NET.lengths(jax.tree.map(lambda a: jnp.stack([a, a]), state.position))
+    np.testing.assert_array_equal(NET.flatten_nodes(js.System(NET, 2.0).mass), [2.0, 2.0, 2.0])

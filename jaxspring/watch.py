@@ -79,6 +79,7 @@ def begin(system: System, ready: System, carry: Carry, dt: Array, limit: Array |
     # Masses first: gravity holds them too, and would be blamed.
     status = Status.when(Flag.INVALID, ~jnp.all(system.mass > 0), step=carry.step)
     status = status.then(Status.when(Flag.NONFINITE, _has_nonfinite(system.mass), step=carry.step))
+    status = status.then(Status.when(Flag.NONFINITE, ~jnp.isfinite(carry.state.time), step=carry.step))
     for i, effect in enumerate(system.parts):
         bad = effect.invalid()
         if bad is not None:

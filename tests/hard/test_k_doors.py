@@ -329,6 +329,19 @@ def test_bad_numbers_under_jit_are_a_status(bad):
     assert not any(found.values()), found
 
 
+def test_a_traced_time_that_is_none():
+    """A state whose time is NaN, traced: NONFINITE before the first step."""
+    system = scene()[0]
+
+    @jax.jit
+    def status(time):
+        return js.rollout(system, js.State.from_points(NET, ALONG, time=time), js.SymplecticEuler(), 0.01, 1).status
+
+    assert status(0.5).is_ok
+    assert status(np.nan).has(js.Flag.NONFINITE)
+    assert status(np.nan).step == 0
+
+
 def test_constants_of_nodes_fit_the_nodes():
     """A constant of each node in another shape would be stretched over the nodes, in silence: refused by name."""
     chain, sheet = js.State.from_points(NET, np.zeros((3, 3)), np.ones((3, 3))), js.lattice((2, 2))

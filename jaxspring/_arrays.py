@@ -124,6 +124,22 @@ def whole_number(name: str, value: Any) -> int:
     return int(value)
 
 
+def on_host(name: str, value: Any, may_be_boolean: bool = False) -> np.ndarray:
+    """`value` as a float64 array on the host, which may share the caller's memory: for what decides on a net.
+
+    Raises:
+        TypeError: what is traced, or holds no real numbers.
+    """
+    array = given(name, value)
+    if isinstance(array, Tracer):
+        raise TypeError(f"{name} is traced (made inside jit, grad or vmap), but decides on which nodes are joined. {BUILD_OUTSIDE}")
+    array = np.asarray(array)
+    if array.dtype.kind not in "iuf" and not (may_be_boolean and array.dtype == np.bool_):
+        raise TypeError(f"{name} has dtype {array.dtype}; expected real numbers.")
+    with np.errstate(over="ignore"):
+        return array.astype(np.float64, copy=False)
+
+
 def _leaves(value: Any) -> Iterable[Any]:
     for part in value:
         if isinstance(part, list | tuple):
@@ -183,4 +199,4 @@ def _from_objects(name: str, array: np.ndarray) -> np.ndarray:
         raise ValueError(f"{name} holds a number that float64 has not: {error}.") from None
 
 
-__all__ = ["BUILD_OUTSIDE", "as_indices", "as_mask", "given", "kept", "own", "whole_number"]
+__all__ = ["BUILD_OUTSIDE", "as_indices", "as_mask", "given", "kept", "on_host", "own", "whole_number"]

@@ -143,6 +143,46 @@ def node_indices(name: str, edges: Any, n_nodes: int) -> np.ndarray:
     return array.astype(np.int32)
 
 
+def triangle_indices(name: str, triangles: Any, n_nodes: int) -> np.ndarray:
+    """`triangles` as a (T, 3) integer array of its own whose every entry names a node 0 ... n_nodes - 1."""
+    array = as_indices(name, triangles)
+    if array.size == 0:
+        return np.zeros((0, 3), np.int32)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise ValueError(f"{name} has shape {array.shape}; expected (T, 3): three node numbers for each triangle.")
+    bad = (array < 0) | (array >= n_nodes)
+    if bad.any():
+        row, column = (int(i) for i in np.argwhere(bad)[0])
+        raise ValueError(
+            f"{name}[{row}] = {tuple(array[row].tolist())} names node {array[row, column]}, but there are n_nodes = {n_nodes} "
+            f"(nodes are 0 to {n_nodes - 1}).\nUnchecked, JAX would read another node instead. Fix {name}[{row}]."
+        )
+    return array.astype(np.int32)
+
+
+def node_values(name: str, value: Any) -> Array:
+    """`value` as one number or a node array, for what has no net at hand to tell the shape.
+
+    Raises:
+        ValueError: more axes than a net has, or a number that is not finite.
+    """
+    value = as_inexact(name, value)
+    if value.ndim > 3:
+        raise ValueError(f"{name} has shape {value.shape}; expected () (one number), or one number per node.")
+    finite(name, value)
+    return value
+
+
+def fits_nodes(name: str, value: Array, state: Any) -> Array:
+    """`value`, which must be one number or an array in the node shape of `state`: other shapes would be stretched over the nodes.
+
+    Raises:
+        ValueError: another shape.
+    """
+    has_shape(name, value, {"one number": (), "node shape: see net.node_field": tuple(state.position.shape)})
+    return value
+
+
 def _first(bad: np.ndarray, numbers: np.ndarray) -> tuple[str, str]:
     index = tuple(int(i) for i in np.argwhere(bad)[0])
     where = "" if not index else "[" + ", ".join(map(str, index)) + "]"

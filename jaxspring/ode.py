@@ -16,7 +16,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ._checks import as_inexact, finite, is_concrete
+from ._arrays import given
+from ._checks import as_inexact, finite, has_shape, is_concrete
 from .state import State
 from .status import Flag, Status
 from .system import System
@@ -276,7 +277,8 @@ def _verdict(result: Any, n_steps: Array) -> Status:
 
 def _check_times(state: State, t1: Any, dt0: Any) -> None:
     for name, value in (("t1", t1), ("dt0", dt0)):
-        if value is not None and is_concrete(value):
+        if value is not None:
+            has_shape(name, given(name, value), {"one number": ()})
             finite(name, value)
     if dt0 is None or not all(is_concrete(value) for value in (state.time, t1, dt0)):
         return

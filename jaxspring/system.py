@@ -15,11 +15,10 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array
 
-from ._arrays import as_indices, as_mask, kept
-from ._checks import as_inexact, has_shape, positive, shape_of
+from ._arrays import as_mask, kept
+from ._checks import as_inexact, finite, has_shape, positive, shape_of, triangle_indices
 from .forces.base import Force, Rule
 from .forces.linearisation import Linearisation
 from .linalg.operators import Blocks, SpringMatrix
@@ -107,6 +106,9 @@ class System(eqx.Module):
         self.rules = tuple(self._adopt_rule(i, r) for i, r in enumerate(rules if isinstance(rules, Iterable) else (rules,))) or None
         self.free = _as_free(net, free)
         self.motion = motion
+        if motion is not None:
+            moved = as_mask("motion.moved", motion.moved, ", True where a node follows the schedule")
+            has_shape("motion.moved", moved, {"node shape": net.node_shape})
 
     def __getstate__(self) -> dict[str, Any]:
         """What pickle stores. Raises PicklingError for a lambda, naming its field."""
@@ -134,8 +136,9 @@ class System(eqx.Module):
         rank = len(self.net.node_shape)
         if shape_of(self.mass) not in ((), self.net.node_shape) or any(len(shape) != rank for shape in self.net.family_shapes):
             raise ValueError(
-                f"the system's mass has shape {shape_of(self.mass)}, that of one system () or {self.net.node_shape}: these are many systems, "
-                f"stacked. Run them by jax.vmap(lambda system: ...)(systems); nets of other springs cannot be stacked, but run one by one."
+                f"the system's mass has shape {shape_of(self.mass)}, that of one system () or {self.net.node_shape}: these are many "
+                f"systems, stacked. Run them by jax.vmap(lambda system: ...)(systems). Nets of other springs cannot be stacked: run each "
+                f"by itself."
             )
 
     def _adopt(self, i: int, force: Any) -> Force:
@@ -322,13 +325,17 @@ def lumped_mass(net: Topology, points: Any, density: Any, triangles: Any = None)
         density: one number.
         triangles: (T, 3) node numbers, or None for a density along springs.
     """
-    density = as_inexact("density", density)
-    positive("density", density, "A node without mass would get an infinite acceleration.")
     points = as_inexact("points", points)
+    density = as_inexact("density", density, points.dtype)
+    has_shape("density", density, {"one number": ()})
+    positive("density", density, "A node without mass would get an infinite acceleration.")
+    if points.ndim != 2 or points.shape[0] != net.n_nodes:
+        raise ValueError(f"points has shape {points.shape}; expected ({net.n_nodes}, D).")
+    finite("points", points)
     if triangles is None:
         lengths = net.lengths(points)
         return net.flatten_nodes(net.incident_sum(net.split(0.5 * density * lengths)))
-    corners = as_indices("triangles", triangles)
+    corners = triangle_indices("triangles", triangles, net.n_nodes)
     a, b, c = (points[corners[:, i]] for i in range(3))
     u, v = b - a, c - a
     squared = jnp.sum(u * u, axis=1) * jnp.sum(v * v, axis=1) - jnp.sum(u * v, axis=1) ** 2

@@ -18,7 +18,7 @@ from jax import lax
 from jaxtyping import Array
 
 from .linalg.base import SolveInfo
-from .numerics import stopped
+from .numerics import cast_inexact, stopped
 from .state import State
 from .status import NOWHERE, Flag, Status
 from .system import System
@@ -74,10 +74,13 @@ def begin(system: System, ready: System, carry: Carry, dt: Array, limit: Array |
     coordinates too large for the springs between them. The constants are read as the user gave them (`system`), which is one array
     where the prepared system (`ready`) holds one for every spring family.
     """
+    if not jax.config.jax_enable_x64:
+        system = cast_inexact(system, carry.state.dtype)  # constants of float64, made before x64 was switched off
     system, ready, carry, dt, limit = stopped((system, ready, carry, dt, limit))
     # Masses first: gravity holds them too, and would be blamed.
     status = Status.when(Flag.INVALID, ~jnp.all(system.mass > 0), step=carry.step)
     status = status.then(Status.when(Flag.NONFINITE, _has_nonfinite(system.mass), step=carry.step))
+    status = status.then(Status.when(Flag.NONFINITE, ~jnp.isfinite(carry.state.time), step=carry.step))
     for i, effect in enumerate(system.parts):
         bad = effect.invalid()
         if bad is not None:

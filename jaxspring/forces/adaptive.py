@@ -20,7 +20,8 @@ from typing import Any
 import equinox as eqx
 from jaxtyping import Array
 
-from .._checks import as_inexact, is_concrete, nonnegative
+from .._arrays import given
+from .._checks import as_inexact, has_shape, is_concrete, nonnegative
 from ..images.image import Image
 from ..images.observation import GradientMagnitude, adaptation
 from ..images.sampling import Bilinear
@@ -75,15 +76,18 @@ class ImageStiffness(StiffnessRule):
         self.image = image
         self.k_min, self.k_max, self.sigma = (as_inexact(n, v) for n, v in (("k_min", k_min), ("k_max", k_max), ("sigma", sigma)))
         for name, value in (("k_min", self.k_min), ("k_max", self.k_max), ("sigma", self.sigma)):
+            has_shape(name, value, {"one number": ()})
             nonnegative(name, value, "Neither a stiffness nor a width can be negative.")
         if is_concrete(self.k_min) and is_concrete(self.k_max) and self.k_min > self.k_max:
             raise ValueError(f"k_min = {self.k_min} is above k_max = {self.k_max}. Swap them.")
         self.observation = GradientMagnitude() if observation is None else observation
         self.sampling = Bilinear() if sampling is None else sampling
-        if radius is None and is_concrete(self.sigma):
+        # Of what was passed: inside `jit` a number is a constant still, but no longer once it is an array.
+        width = given("sigma", sigma)
+        if radius is None and is_concrete(width) and all(map(is_concrete, image.spacing)):
             from ..images.smoothing import smoothing_radius
 
-            radius = smoothing_radius(float(self.sigma), (float(image.spacing[0]), float(image.spacing[1])))
+            radius = smoothing_radius(float(width), (float(image.spacing[0]), float(image.spacing[1])))
         self.radius = radius
         self.adapted = None
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from .._checks import as_inexact, nonnegative
+from .._checks import fits_nodes, node_values, nonnegative
 from ..linalg.operators import Blocks, SpringBlocks, isotropic
 from ..numerics import cast_inexact, tiny
 from ..state import State
@@ -42,12 +42,12 @@ class Drag(Force):
     gamma: Array
 
     def __init__(self, gamma: Any):
-        self.gamma = as_inexact("gamma", gamma)
+        self.gamma = node_values("gamma", gamma)
         nonnegative("gamma", self.gamma, "A negative drag feeds energy in.")
 
     def force(self, state: State) -> Vector:
         """-gamma v [N]."""
-        return -(self.gamma * state.velocity)
+        return -(fits_nodes("gamma", self.gamma, state) * state.velocity)
 
     def damping_blocks(self, state: State) -> Blocks:
         """Gamma on the diagonal [N s/m]."""
@@ -85,7 +85,7 @@ class Dashpots(Force):
 
     Attributes:
         net: the topology.
-        damping: c [N s/m]: a number, (E,) in the user's order, or an `EdgeField`.
+        damping: c [N s/m]: a number, (E,) in the user's order, an `EdgeField`, or numbers by family, as in `Springs`.
     """
 
     net: Topology

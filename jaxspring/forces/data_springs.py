@@ -16,7 +16,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._checks import as_inexact, finite, nonnegative
+from .._checks import as_inexact, finite, fits_nodes, has_shape, node_values, nonnegative
 from ..images.image import Image
 from ..images.sampling import Bilinear
 from ..images.surface import Surface
@@ -46,7 +46,7 @@ class DataSprings(Force):
 
     def __init__(self, image: Image, stiffness: Any, sampling: Any = None, conservative: bool = False):
         self.image = image
-        self.stiffness = as_inexact("stiffness", stiffness)
+        self.stiffness = node_values("stiffness", stiffness)
         self.sampling = Bilinear() if sampling is None else sampling
         self.conservative = conservative
         nonnegative("stiffness", self.stiffness, "A negative data spring pushes away from the image.")
@@ -58,6 +58,7 @@ class DataSprings(Force):
     def force(self, state: State) -> Vector:
         """Pull toward the image [N]."""
         x, y, z = _coordinates(state)
+        fits_nodes("stiffness", self.stiffness, state)
         if not self.conservative:
             zero = jnp.zeros_like(z)
             return Vector((zero, zero, self.stiffness * (_surface(self).value(x, y) - z)))
@@ -116,6 +117,7 @@ class ImageAttraction(Force):
     def __init__(self, image: Image, strength: Any, sampling: Any = None):
         self.image = image
         self.strength = as_inexact("strength", strength)
+        has_shape("strength", self.strength, {"one number": ()})
         finite("strength", self.strength)
         self.sampling = Bilinear() if sampling is None else sampling
 

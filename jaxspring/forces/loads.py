@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._checks import as_inexact, finite, shape_of
+from .._checks import as_inexact, finite, fits_nodes, node_values, shape_of
 from ..state import State
 from ..topology.base import Topology
 from ..vector import Vector
@@ -33,7 +33,7 @@ class Gravity(Force):
             raise ValueError(
                 f"acceleration has shape {self.acceleration.shape}; expected (D,), one number per coordinate, e.g. (0, 0, -9.81)."
             )
-        self.mass = None if mass is None else as_inexact("mass", mass)
+        self.mass = None if mass is None else node_values("mass", mass)
 
     def with_mass(self, mass: Array) -> Gravity:
         """The same gravity acting on these masses; masses that were given stay."""
@@ -41,6 +41,7 @@ class Gravity(Force):
 
     def force(self, state: State) -> Vector:
         """Weight m g [N]."""
+        fits_nodes("mass", self._mass(), state)
         return Vector(tuple(self._weight(g, a) for g, a in zip(self._acceleration(state), state.position, strict=True)))
 
     def energy(self, state: State) -> Array:

@@ -20,7 +20,7 @@ from typing import Any
 import equinox as eqx
 from jaxtyping import Array
 
-from .._checks import as_inexact, nonnegative
+from .._checks import as_inexact, fits_nodes, node_values, nonnegative
 from ..linalg.operators import Blocks, isotropic
 from ..numerics import cast_inexact
 from ..state import State
@@ -57,7 +57,7 @@ class Rayleigh(Force):
         self.mass_rate = _coefficient("mass_rate", mass_rate)
         self.stiffness_time = _coefficient("stiffness_time", stiffness_time)
         self.forces = (forces,) if isinstance(forces, Force) else None if forces is None else tuple(forces)
-        self.mass = None if mass is None else as_inexact("mass", mass)
+        self.mass = None if mass is None else node_values("mass", mass)
 
     @staticmethod
     def from_ratios(first: tuple[Any, Any], second: tuple[Any, Any], forces: Any = None) -> Rayleigh:
@@ -109,6 +109,7 @@ class Rayleigh(Force):
     def damping_blocks(self, state: State) -> Blocks:
         """Blocks of a M + b K in this state [N s/m]."""
         mass, forces = self._bound()
+        fits_nodes("mass", mass, state)
         blocks = Blocks((isotropic(self.mass_rate * mass, state.position),))
         for force in forces:
             stiffness = force.stiffness_blocks(state, Tangent())

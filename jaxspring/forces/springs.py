@@ -16,6 +16,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from .._arrays import whole_number
 from .._checks import finite, is_concrete, nonnegative, positive
 from ..linalg.operators import Blocks, SpringBlocks
 from ..numerics import cast_inexact, tiny
@@ -72,8 +73,9 @@ class Springs(Force):
 
     Attributes:
         net: the topology.
-        stiffness: k [N/m]: a number, (E,) in the user's order, an `EdgeField`, or a `StiffnessRule`.
-        rest_length: l [m]: a number, (E,) or an `EdgeField`.
+        stiffness: k [N/m]: a number, (E,) in the user's order, an `EdgeField`, or a `StiffnessRule`; on a lattice also numbers by family,
+            `{js.STRUCTURAL: 100.0, js.SHEAR: 20.0}`.
+        rest_length: l [m]: as the stiffness.
         law: the law of one spring; `Hooke()` unless said.
         axes: the coordinates the springs act in (None: all). `axes=(0, 1)` makes springs of the projection on the plane.
         allow_negative_stiffness: accept stiffnesses below zero, which push without bound.
@@ -108,7 +110,9 @@ class Springs(Force):
         self.stiffness = stiffness if isinstance(stiffness, StiffnessRule) else _edge_constant(net, "stiffness", stiffness)
         self.rest_length = _edge_constant(net, "rest_length", rest_length)
         self.law = Hooke() if law is None else law
-        self.axes = None if axes is None else tuple(int(a) for a in axes)
+        self.axes = None if axes is None else tuple(whole_number("axes", a) for a in axes)
+        if self.axes is not None and not (self.axes and set(self.axes) <= {0, 1, 2} and len(set(self.axes)) == len(self.axes)):
+            raise ValueError(f"axes = {self.axes}; expected different coordinates out of 0 (x), 1 (y), 2 (z), e.g. (0, 1).")
         self.allow_negative_stiffness = allow_negative_stiffness
         self.expansion = expansion
         if not isinstance(stiffness, StiffnessRule):
@@ -254,6 +258,8 @@ class Springs(Force):
         return isinstance(self.stiffness, StiffnessRule) and self.stiffness.follows_position
 
     def _seen(self, state: State) -> Vector:
+        if self.axes is not None and max(self.axes) >= state.dim:
+            raise ValueError(f"axes = {self.axes}, but the positions have {state.dim} coordinates.")
         return state.position if self.axes is None else Vector(tuple(state.position[a] for a in self.axes))
 
     def _constants(self, state: State) -> tuple[Array | EdgeField, Array | EdgeField]:

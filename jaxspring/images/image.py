@@ -23,6 +23,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from .._arrays import given, own
+from .._checks import as_inexact, shape_of
 from .sampling import Bilinear, Sampling
 from .surface import Surface
 
@@ -108,15 +109,18 @@ def of_order_one(values: Array) -> Array:
 
 def _per_axis(name: str, value: PerAxis, dtype: jnp.dtype, must_be_positive: bool = False) -> tuple[Array, Array]:
     """A number, or a pair (x, y), as two scalar arrays of the pixels' type."""
-    given: Any = value
-    pair: tuple[Any, ...] = tuple(given) if isinstance(given, (tuple, list)) or np.ndim(given) == 1 else (given, given)
-    if len(pair) != 2 or any(np.ndim(part) for part in pair):
+    pair: Any = value if isinstance(value, tuple | list) else given(name, value)
+    pair = tuple(pair) if isinstance(pair, tuple | list) or pair.ndim == 1 else (pair, pair)
+    if len(pair) != 2 or any(shape_of(part) for part in pair):
         raise ValueError(f"{name} must be one number or a pair (along x, along y), got {value!r}.")
+    owned = tuple(as_inexact(name, part, dtype) for part in pair)
     for axis, part in zip("xy", pair, strict=True):
+        # In the pixels' type: what is rounded to zero is none.
+        part = part if isinstance(part, Tracer) else np.asarray(given(name, part)).astype(dtype)
         if not isinstance(part, Tracer) and not (np.isfinite(part) and (part > 0 or not must_be_positive)):
             wanted = "positive and finite" if must_be_positive else "finite"
             raise ValueError(f"{name} along {axis} is {part}, but must be {wanted}: every sample would be wrong. Correct {name}.")
-    return own(name, pair[0], dtype), own(name, pair[1], dtype)
+    return owned[0], owned[1]
 
 
 def _as_pixels(values: ArrayLike) -> Array:

@@ -24,7 +24,8 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
-from .._arrays import own
+from .._arrays import given
+from .._checks import as_inexact, finite, has_shape
 from .image import Image
 from .image import Image, of_order_one
 from .smoothing import Length, smooth
@@ -120,10 +121,14 @@ class Combined(Observation):
     weights: tuple[Array, ...]
 
     def __init__(self, observations: Sequence[Callable[[Image], Array]], weights: Sequence[ArrayLike]):
+        weights = weights if isinstance(weights, tuple | list) else tuple(given("weights", weights))
         if len(observations) != len(weights) or not observations:
             raise ValueError(f"{len(observations)} observations and {len(weights)} weights: pass at least one, and one weight for each.")
         self.observations = tuple(observations)
-        self.weights = tuple(own("weights", weight, jnp.result_type(float)) for weight in weights)
+        self.weights = tuple(as_inexact("weights", weight, jnp.result_type(float)) for weight in weights)
+        for i, weight in enumerate(self.weights):
+            has_shape(f"weights[{i}]", weight, {"one number": ()})
+            finite(f"weights[{i}]", weight)
 
     def __call__(self, image: Image) -> Array:
         """The weighted sum, `(ny, nx)`."""

@@ -16,7 +16,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
-from .._arrays import own
+from .._arrays import given
+from .._checks import as_inexact, has_shape
 from .filtering import band_distance, filter_axis
 from .image import Image
 
@@ -44,6 +45,9 @@ def smooth(image: Image, sigma: Length, radius: int | None = None) -> Image:
     >>> print((1000 * smooth(spike, 1.0).values).round())
     [[ 58. 242. 399. 242.  58.]]
     """
+    sigma = given("sigma", sigma)
+    width = as_inexact("sigma", sigma, image.dtype)
+    has_shape("sigma", width, {"one number": ()})
     is_traced = any(isinstance(length, Tracer) for length in (sigma, *image.spacing))
     if radius is None:
         if is_traced:
@@ -57,11 +61,10 @@ def smooth(image: Image, sigma: Length, radius: int | None = None) -> Image:
         least = smoothing_radius(sigma, image.spacing, deviations=2.0)
         if radius < least:
             raise ValueError(f"radius = {radius} pixels is under two standard deviations, sigma = {float(sigma)}: pass radius >= {least}.")
-    sigma = own("sigma", sigma, image.dtype)
     values = image.values
     for axis, spacing in ((1, image.spacing[0]), (0, image.spacing[1])):
         if values.shape[axis] > 1:
-            values = filter_axis(values, _gaussian_band(sigma / spacing, radius), radius, axis, mode="symmetric")
+            values = filter_axis(values, _gaussian_band(width / spacing, radius), radius, axis, mode="symmetric")
     return image.with_values(values)
 
 

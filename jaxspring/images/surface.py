@@ -16,6 +16,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
+from .._arrays import given
 from .sampling import Sampling
 
 # One program instead of a dozen where a method is called outside `jit`; inside, it leaves no trace.
@@ -26,8 +27,8 @@ class Surface(eqx.Module):
     """An image with its coefficients for one way of sampling, from `Image.surface`.
 
     The result has the floating type of the points, not of the pixels, so a float32 state stays float32. A coordinate that is NaN or
-    infinite gives NaN, and so does everything where a traced spacing is not positive or an origin not finite; any other coordinate outside is clamped, however
-    far.
+    infinite gives NaN, and so does everything where a traced spacing is not positive or an origin not finite; any other coordinate
+    outside is clamped, however far.
     """
 
     coefficients: Array
@@ -73,9 +74,7 @@ class Surface(eqx.Module):
         x, y = _points(x, y)
         column = _along(x, self.origin[0], self.spacing[0], self.shape[1])
         row = _along(y, self.origin[1], self.spacing[1], self.shape[0])
-        # A spacing or origin that is none, where its constructor could not look at it: NaN, not a pixel of the border.
-        is_sound = jnp.stack([(s > 0) & jnp.isfinite(s) & jnp.isfinite(o) for s, o in zip(self.spacing, self.origin, strict=True)])
-        return (column, row), jnp.isfinite(x) & jnp.isfinite(y) & jnp.all(is_sound)
+        return (column, row), jnp.isfinite(x) & jnp.isfinite(y)
 
     def _block(self, column: _Along, row: _Along) -> list[list[Array]]:
         """The coefficients around each point, as `block[a][b]` along rows and columns."""
@@ -120,6 +119,7 @@ def _weighted(weights: Sequence[Array], terms: Sequence[Array]) -> Array:
 def _points(x: ArrayLike, y: ArrayLike) -> tuple[Array, Array]:
     """Both coordinates as floating arrays of one shape and one type."""
     # A Python number follows the other coordinate; whole numbers become the default float.
+    x, y = given("x", x), given("y", y)
     dtype = jnp.result_type(x, y)
     if not jnp.issubdtype(dtype, jnp.floating):
         dtype = jnp.result_type(float)

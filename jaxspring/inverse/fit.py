@@ -258,7 +258,9 @@ class _Run:
 
 def _as_array(leaf: Any) -> Any:
     """Numbers as arrays of fixed type, so that no iteration is traced twice."""
-    return own("carried", leaf, jax.numpy.result_type(leaf)) if eqx.is_array_like(leaf) else leaf
+    if isinstance(leaf, np.ndarray):
+        return own("carried", leaf)
+    return jax.numpy.asarray(leaf, jax.numpy.result_type(leaf)) if eqx.is_array_like(leaf) else leaf
 
 
 def _check_numbers(n_iterations: int, resume: bool, checkpoint: Checkpoint | None) -> None:

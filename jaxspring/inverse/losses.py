@@ -6,8 +6,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
-from .._arrays import own
-from .._checks import shape_of
+from .._checks import as_inexact, finite, shape_of
 
 
 def squared_distance(points: Array, target: ArrayLike) -> Array:
@@ -16,6 +15,8 @@ def squared_distance(points: Array, target: ArrayLike) -> Array:
     >>> print(squared_distance(jnp.zeros((2, 3)), jnp.ones((2, 3))))
     3.0
     """
+    target = as_inexact("target", target, points.dtype)
+    finite("target", target)
     if shape_of(points) != shape_of(target):
         raise ValueError(f"points have shape {shape_of(points)}, target has {shape_of(target)}; expected the same.")
-    return jnp.mean(jnp.sum((points - own("target", target, points.dtype)) ** 2, axis=-1))
+    return jnp.mean(jnp.sum((points - target) ** 2, axis=-1))

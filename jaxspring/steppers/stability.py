@@ -40,7 +40,7 @@ def stable_dt(system: System, state: State, stepper: Stepper | None = None) -> A
     2.0
     """
     stepper = SymplecticEuler() if stepper is None else stepper
-    limit = dt_limit(system.prepare(state.dtype), state, stepper)
+    limit = dt_limit(system.prepare(state.checked().dtype), state, stepper)
     if limit is None:
         raise TypeError(f"{type(stepper).__name__} has no known stability limit (its `limit` returns None).")
     return limit

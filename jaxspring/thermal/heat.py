@@ -19,7 +19,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from .._checks import as_inexact, finite, has_shape, nonnegative, positive
+from .._checks import as_inexact, finite, nonnegative, positive
 from ..forces.base import Rule, any_refused
 from ..linalg.operators import SpringBlocks
 from ..numerics import cast_inexact, stopped
@@ -93,7 +93,7 @@ class Heat(Rule):
         Args:
             net: the topology along which heat flows.
             capacity: [J/K]: a number, or (N,) in the user's order; see `capacities`.
-            conductance: [W/K]: a number, (E,) in the user's order, or an edge field; see `conductances`.
+            conductance: [W/K]: a number, (E,) in the user's order, an edge field (`conductances`), or numbers by family (`Springs`).
             scheme: `ExplicitHeat()` unless said.
             boundaries: one or several; where none is named the body is insulated.
             source: [W]: a number, (N,) in the user's order, or a function of time [s] that gives a number or a node array.

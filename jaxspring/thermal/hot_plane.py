@@ -16,7 +16,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._checks import as_inexact, finite, nonnegative, plane
+from .._checks import as_inexact, finite, has_shape, node_values, nonnegative, plane
 from ..forces.base import any_refused
 from ..state import State
 from ..topology.base import Topology
@@ -64,12 +64,13 @@ class HotPlane(ThermalBoundary):
         self.point, self.normal = plane(point, normal)
         self.temperature = temperature if callable(temperature) else as_inexact("temperature", temperature)
         self.coefficient = as_inexact("coefficient", coefficient)
-        self.area = as_inexact("area", area)
+        self.area = node_values("area", area)
         self.reach = as_inexact("reach", reach)
         self.fade = as_inexact("fade", fade)
-        if not callable(temperature):
-            finite("temperature", self.temperature)
-        finite("reach", self.reach)
+        numbers = {"coefficient": self.coefficient, "reach": self.reach, "fade": self.fade}
+        for name, value in (numbers if callable(temperature) else {**numbers, "temperature": self.temperature}).items():
+            has_shape(name, value, {"one number": ()})
+            finite(name, value)
         for name, value in (("coefficient", self.coefficient), ("area", self.area), ("fade", self.fade)):
             nonnegative(name, value, "Heat would flow from cold to hot." if name != "fade" else "A length cannot be negative.")
 

@@ -18,7 +18,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._checks import as_inexact, finite, nonnegative
+from .._checks import node_values, nonnegative
 from ..forces.base import any_refused
 from ..topology.base import Topology
 
@@ -38,9 +38,8 @@ class LatentHeat(eqx.Module):
     latent: Array
 
     def __init__(self, melting: Any, latent: Any):
-        self.melting = as_inexact("melting", melting)
-        self.latent = as_inexact("latent", latent)
-        finite("melting", self.melting)
+        self.melting = node_values("melting", melting)
+        self.latent = node_values("latent", latent)
         nonnegative("latent", self.latent, "Melting takes heat up.")
 
     def on(self, net: Topology) -> LatentHeat:

@@ -56,6 +56,8 @@ class ThermalStiffness(StiffnessRule):
 
     def __init__(self, stiffness: Any, softening: Any, melting: Any, sharpness: Any = None):
         self.full = stiffness if isinstance(stiffness, EdgeField) else as_inexact("stiffness", stiffness)
+        if not isinstance(self.full, EdgeField) and self.full.ndim > 1:
+            raise ValueError(f"stiffness has shape {self.full.shape}; expected () (one number), or (E,) (one per spring).")
         for i, entry in enumerate(self.full.families if isinstance(self.full, EdgeField) else (self.full,)):
             nonnegative(
                 f"stiffness.families[{i}]" if isinstance(self.full, EdgeField) else "stiffness", entry, "It would push without bound."

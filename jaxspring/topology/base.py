@@ -239,12 +239,15 @@ class Topology(eqx.Module):
         return Vector(tuple(self._order_nodes(points[:, i]) for i in range(points.shape[1])))
 
     def flatten_nodes(self, a: Array) -> Array:
-        """Node array (leading axes allowed) -> (..., N) in the user's order."""
-        return self.layout.flatten(a)
+        """Node array (leading axes allowed) -> (..., N) in the user's order; one number is repeated."""
+        a = own("a", a)
+        return self.layout.flatten(a if a.ndim else jnp.broadcast_to(a, self.node_shape))
 
     def lengths(self, position: Any) -> Array:
         """(E,) lengths of the springs [m] in the user's order, for a `Vector` or an (N, D) array of positions."""
         x = position if isinstance(position, Vector) else self.vector_field(position, "position")
+        if x.shape != self.node_shape:
+            raise ValueError(f"position has shape {x.shape}, that of one state is {self.node_shape}. Take many by jax.vmap(net.lengths).")
         return self.flatten(self.difference(x).map(lambda d: d.norm()))
 
     def _order_nodes(self, flat: Array) -> Array:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from .._arrays import given
+from .._arrays import as_indices, given, on_host
 from .._checks import finite
 from .graph import Graph
 from .reduction import Gather, Scatter
@@ -38,11 +38,9 @@ def from_triangles(triangles: Any, n_nodes: int, *, reduction: Reductions = None
     >>> net.n_springs, net.triangles.shape
     (5, (2, 3))
     """
-    corners = np.asarray(triangles)
+    corners = as_indices("triangles", triangles)
     if corners.ndim != 2 or corners.shape[1] != 3 or not len(corners):
         raise ValueError(f"triangles has shape {corners.shape}; expected (T, 3): three node numbers for each of T >= 1 triangles.")
-    if corners.dtype == np.bool_ or not np.issubdtype(corners.dtype, np.integer):
-        raise TypeError(f"triangles has dtype {corners.dtype}; expected integer node numbers.")
     _check_corners(corners, n_nodes)
     return Graph.from_edges(_sides(corners), n_nodes, triangles=corners, reduction=reduction)
 
@@ -66,7 +64,7 @@ def delaunay(points: Any, *, reduction: Reductions = None) -> Graph:
     """
     from scipy.spatial import Delaunay, QhullError
 
-    points = np.asarray(points, float)
+    points = on_host("points", points)
     if points.ndim != 2 or points.shape[1] not in (2, 3):
         raise ValueError(f"points has shape {points.shape}; expected (N, 2) or (N, 3). A chain needs no triangulation: use lattice(N).")
     finite("points", points)
@@ -148,7 +146,7 @@ def from_scipy(matrix: Any, *, reduction: Reductions = None) -> tuple[Graph, np.
     """
     from scipy.sparse import coo_array, issparse
 
-    matrix = coo_array(matrix if issparse(matrix) else np.asarray(given("matrix", matrix)))
+    matrix = coo_array(matrix if issparse(matrix) else on_host("matrix", matrix, may_be_boolean=True))
     if matrix.dtype.kind not in "biuf":
         raise TypeError(f"matrix has dtype {matrix.dtype}; expected real numbers.")
     matrix = matrix.astype(np.float64)  # before what is stored twice is summed: small types wrap round

@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from .._arrays import as_indices, whole_number
-from .._checks import node_indices
+from .._arrays import whole_number
+from .._checks import node_indices, triangle_indices
 from ..vector import Vector
 from .base import Topology
 from .edge_field import EdgeField
@@ -89,7 +89,7 @@ class Graph(Topology):
             heads=jnp.asarray(heads),
             reduction=sums,
             box=_as_box(box),
-            triangles=None if triangles is None else _as_triangles(triangles),
+            triangles=None if triangles is None else _as_triangles(triangles, n_nodes),
             count=n_nodes,
             nodes=nodes,
             springs=springs,
@@ -164,9 +164,9 @@ class Graph(Topology):
         return v.map(lambda a: function(a, self.tails, self.heads))
 
 
-def _as_triangles(triangles: Any) -> np.ndarray:
+def _as_triangles(triangles: Any, n_nodes: int) -> np.ndarray:
     """Triangles of the net's own, which nobody can change."""
-    own = as_indices("triangles", triangles).astype(np.int32)
+    own = triangle_indices("triangles", triangles, n_nodes)
     own.setflags(write=False)
     return own
 

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from ..._checks import as_inexact, nonnegative
+from ..._checks import constant
 from ...forces.base import Force
 from ...linalg.cg import JaxCG, SolveInfo
 from ...state import State
@@ -151,8 +151,7 @@ class PixelSprings(Force):
 
     def __init__(self, equations: NormalEquations, stiffness: Array | float):
         self.equations = equations
-        self.stiffness = as_inexact("stiffness", stiffness)
-        nonnegative("stiffness", self.stiffness, "A negative data spring pushes away from the image.")
+        self.stiffness = constant("stiffness", stiffness, "A negative data spring pushes away from the image.", may_be_zero=True)
 
     def force(self, state: State) -> Vector:
         """K (b - N z) along the last coordinate [N], zero along the others."""

@@ -1,0 +1,224 @@
+"""The doors of the library in one place: every public name that takes arrays, how it is built from them, and names that take none.
+
+A door is a function of arrays by field name, with good values for them. `tests/api/test_doors.py` fails where a public name stands neither
+here nor among those that take no array of the user's.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxspring as js
+
+
+@dataclass(frozen=True)
+class Door:
+    """How one public name is built from arrays.
+
+    Attributes:
+        build: fields -> what holds their values.
+        fields: good values.
+        on_host: fields that decide on shapes or are read by the host, and so can never be traced.
+    """
+
+    build: Callable[..., Any]
+    fields: dict[str, Any]
+    on_host: tuple[str, ...] = ()
+
+
+N, E = 4, 3
+TRIANGLES = np.array([[0, 1, 2], [1, 2, 3]])
+SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.1, 1.0]])
+PIXELS = np.arange(1.0, 31.0).reshape(5, 6)
+PATTERN = np.array([True, False, True, True])
+
+
+def net() -> js.Lattice:
+    """A chain of four nodes."""
+    return js.lattice(N)
+
+
+def image() -> js.Image:
+    """A good image."""
+    return js.Image(PIXELS)
+
+
+def system(**forces) -> js.System:
+    """Springs on the chain."""
+    return js.System(net(), 1.0, js.Springs(net(), 5.0, 1.0))
+
+
+def state() -> js.State:
+    """The chain at rest."""
+    return js.State.from_points(net(), 1.1 * net().grid())
+
+
+def per_node(seed: float = 1.0) -> np.ndarray:
+    """(N,) values above zero."""
+    return seed + 0.25 * np.arange(N)
+
+
+def per_spring(seed: float = 1.0) -> np.ndarray:
+    """(E,) values above zero."""
+    return seed + 0.5 * np.arange(E)
+
+
+def number(value: float) -> np.ndarray:
+    """One number as an array without axes."""
+    return np.asarray(value)
+
+
+DOORS: dict[str, Door] = {
+    "Combined": Door(lambda weights: js.Combined((js.Intensity(), js.Curvature()), weights), {"weights": np.array([1.0, 2.0])}),
+    "Convection": Door(
+        lambda **a: js.Convection(net(), **a),
+        {"nodes": PATTERN, "coefficient": per_node(), "ambient": per_node(280), "area": per_node()},
+    ),
+    "Dashpots": Door(lambda damping: js.Dashpots(net(), damping), {"damping": per_spring()}),
+    "DataSprings": Door(lambda stiffness: js.DataSprings(image(), stiffness), {"stiffness": per_node()}),
+    "Drag": Door(js.Drag, {"gamma": per_node()}),
+    "EdgeField": Door(lambda value: js.EdgeField((value,)), {"value": per_spring()}),
+    "FixedTemperature": Door(lambda **a: js.FixedTemperature(net(), **a), {"nodes": PATTERN, "temperature": per_node(300)}),
+    "Floor": Door(
+        js.Floor,
+        {"point": np.array([0.0, 1.0]), "normal": np.array([0.0, 2.0]), "friction": number(0.25), "restitution": number(0.5)},
+    ),
+    "Fluid": Door(lambda core: js.Fluid(js.SlideLaw(1.0, 1.0), core=core), {"core": number(0.125)}),
+    "Fusing": Door(lambda melting: js.Fusing(net(), melting), {"melting": number(350.0)}),
+    "Graph": Door(
+        lambda edges, triangles, box: js.Graph.from_edges(edges, N, triangles=triangles, box=box),
+        {"edges": np.array([[0, 1], [1, 2], [2, 3]]), "triangles": TRIANGLES, "box": np.array([8.0, 9.0])},
+        on_host=("edges", "triangles"),
+    ),
+    "Gravity": Door(js.Gravity, {"acceleration": np.array([0.0, -9.5]), "mass": per_node()}),
+    "Heat": Door(lambda **a: js.Heat(net(), **a), {"capacity": per_node(), "conductance": per_spring(), "source": per_node()}),
+    "HeatFlux": Door(lambda **a: js.HeatFlux(net(), **a), {"nodes": PATTERN, "flux": per_node(), "area": per_node()}),
+    "HotPlane": Door(
+        js.HotPlane,
+        {
+            "point": np.array([0.0, 1.0]),
+            "normal": np.array([0.0, 2.0]),
+            "temperature": number(400.0),
+            "coefficient": number(3.0),
+            "area": per_node(),
+            "reach": number(0.5),
+            "fade": number(0.25),
+        },
+    ),
+    "Image": Door(js.Image, {"values": PIXELS, "spacing": np.array([1.0, 2.0]), "origin": np.array([0.5, 0.25])}),
+    "ImageAttraction": Door(lambda strength: js.ImageAttraction(image(), strength), {"strength": number(2.0)}),
+    "ImageStiffness": Door(
+        lambda **a: js.ImageStiffness(image(), radius=4, **a), {"k_min": number(1.0), "k_max": number(9.0), "sigma": number(1.0)}
+    ),
+    "LatentHeat": Door(js.LatentHeat, {"melting": per_node(350), "latent": per_node()}),
+    "LennardJones": Door(js.LennardJones, {"epsilon": number(2.0), "sigma": number(0.5)}),
+    "Load": Door(lambda forces: js.Load.from_points(net(), forces), {"forces": np.arange(8.0).reshape(N, 2)}),
+    "Motion": Door(lambda moved: js.Motion(moved, lambda t: t), {"moved": PATTERN}),
+    "NeighbourList": Door(lambda skin: js.NeighbourList(8, skin), {"skin": number(0.5)}),
+    "PairDrag": Door(js.PairDrag, {"damping": number(2.0), "radius": number(1.5)}),
+    "PixelSprings": Door(lambda stiffness: js.PixelSprings(None, stiffness), {"stiffness": number(2.0)}),
+    "PlainCutoff": Door(js.PlainCutoff, {"radius": number(2.5)}),
+    "Radiation": Door(
+        lambda **a: js.Radiation(net(), **a),
+        {"nodes": PATTERN, "emissivity": per_node(0.125), "ambient": per_node(280), "area": per_node()},
+    ),
+    "Rayleigh": Door(js.Rayleigh, {"mass_rate": number(0.5), "stiffness_time": number(0.25), "mass": per_node()}),
+    "Refreezing": Door(js.Refreezing, {"hysteresis": number(5.0), "reach": number(1.5)}),
+    "ShiftedForce": Door(js.ShiftedForce, {"radius": number(2.5)}),
+    "SlideLaw": Door(js.SlideLaw, {"alpha": number(1.0), "beta": number(2.0), "zeta": number(0.5)}),
+    "Springs": Door(lambda **a: js.Springs(net(), **a), {"stiffness": per_spring(), "rest_length": per_spring(0.5)}),
+    "State": Door(
+        lambda **a: js.State.from_points(net(), **a),
+        {
+            "points": np.arange(8.0).reshape(N, 2),
+            "velocities": np.arange(8.0).reshape(N, 2),
+            "time": number(1.5),
+            "temperature": per_node(300),
+        },
+    ),
+    "Switched": Door(js.Switched, {"on": number(2.0), "off": number(2.5)}),
+    "System": Door(lambda **a: js.System(net(), **a), {"mass": per_node(), "free": PATTERN}),
+    "ThermalExpansion": Door(js.ThermalExpansion, {"coefficient": number(0.5), "reference": number(300.0)}),
+    "ThermalStiffness": Door(
+        js.ThermalStiffness,
+        {"stiffness": per_spring(), "softening": number(300.0), "melting": number(400.0), "sharpness": number(2.0)},
+    ),
+    "UnitVectorLaw": Door(js.UnitVectorLaw, {"alpha": number(1.0), "beta": number(2.0), "zeta": number(0.5)}),
+    "Vector": Door(lambda value: js.Vector((value, value)), {"value": per_node()}),
+    "adaptation": Door(lambda sigma: js.adaptation(image(), sigma, radius=4), {"sigma": number(1.0)}),
+    "capacities": Door(
+        lambda **a: js.capacities(net(), **a),
+        {"density": per_node(), "specific_heat": per_node(), "spacing": number(0.5), "section": number(2.0)},
+    ),
+    "conductances": Door(
+        lambda **a: js.conductances(net(), **a), {"conductivity": per_node(), "spacing": number(0.5), "section": number(2.0)}
+    ),
+    "delaunay": Door(js.delaunay, {"points": SQUARE}, on_host=("points",)),
+    "from_scipy": Door(js.from_scipy, {"matrix": np.array([[0.0, 2.0], [2.0, 0.0]])}, on_host=("matrix",)),
+    "from_triangles": Door(lambda triangles: js.from_triangles(triangles, N), {"triangles": TRIANGLES}, on_host=("triangles",)),
+    "gentle_fluid": Door(js.gentle_fluid, {"spacing": number(0.5), "zeta": number(0.25), "alpha": number(2.0)}),
+    "image_from_array": Door(js.image_from_array, {"pixels": PIXELS}),
+    "lattice": Door(lambda box: js.lattice((4, 4), periodic=True, box=box), {"box": np.array([4.0, 4.0])}),
+    "link_conductances": Door(
+        lambda **a: js.link_conductances(net(), **a), {"conductivity": per_node(), "area": per_spring(), "length": per_spring()}
+    ),
+    "lumped_mass": Door(
+        lambda **a: js.lumped_mass(js.from_triangles(TRIANGLES, N), **a),
+        {"points": SQUARE, "density": number(2.0), "triangles": TRIANGLES},
+        on_host=("triangles",),
+    ),
+    "replace": Door(lambda **a: js.replace(system(), **a), {"stiffness": per_spring(), "rest_length": per_spring(), "mass": per_node()}),
+    "rollout": Door(lambda dt: js.rollout(system(), state(), js.SymplecticEuler(), dt, 2).state, {"dt": number(0.0625)}),
+    "smooth": Door(lambda sigma: js.smooth(image(), sigma, radius=4), {"sigma": number(1.0)}),
+    "squared_distance": Door(lambda target: js.squared_distance(jnp.zeros((N, 2)), target), {"target": np.arange(8.0).reshape(N, 2)}),
+}
+
+# Doors whose work is too long for every form of every field: tested by hand below or elsewhere.
+BY_HAND = {"diffeqsolve", "fit", "check_gradient", "frequency_response", "from_networkx", "plot"}
+
+# What the library makes and hands out; nobody else builds it.
+MADE_INSIDE = """
+    Account Blocks Energy Equilibrium Finding Fit Gather GradientCheck History Iteration Modes NodeDyads OdeInfo OdeResult Profile
+    Result Resume Scatter Selection SkylineFactor SolveInfo Solves SpringBlocks SpringMatrix Status Surface Reconstructed
+"""
+
+# Objects made of options, other objects, functions or files: no array of the user's enters.
+NO_ARRAYS = """
+    AllPairs Adam BDF2 BackwardEuler BackwardEulerHeat Bilinear BlockJacobi Bounded CG Cells Channel Checkpoint CheckpointError
+    Checkpointed ConstantsSettings CrankNicolsonHeat CubicSpline Curvature Cutoff EnergyLaw EqualCells ExactSolver ExactTangent
+    ExpansionRule ExplicitHeat Flag Force ForwardEuler GradientMagnitude GradientWarning HalfCells HeatIteration HeatScheme Hooke
+    Identity ImageError ImplicitMidpoint Intensity Jacobi JaxCG LBFGS Lattice Law LeastSquares Ledger LinearSolver Linearisation
+    Lineax Luminance Molten Multigrid Natural Newton NoCutoff Observation Optax Optimiser Ordering PairLaw Pairs Positive PowerLaw
+    Preconditioner Progress PullLaw Reconstruction Relaxation ReverseCuthillMcKee RungeKutta4 Sampling Secant SemiImplicit
+    SimulationError Skyline SoftPositive SplitHeat SpringSettings StabilityWarning Stepper StiffnessRule Still Stop StopReason
+    StoreAll StoreStates SymmetricSplitHeat SymplecticEuler Tangent TensionOnly ThermalBoundary Topology Transform Unpreconditioned
+    VelocityVerlet animate elevation_model energy_ledger equilibrium fit_constants fit_springs from_mesh gradient_magnitude load
+    load_image melted_fraction normal_modes principal_curvatures raise_for_status save save_trajectory select smoothing_radius
+    stable_dt total_heat
+"""
+
+
+def at_offset(template: np.ndarray, dtype: np.dtype, offset: int) -> np.ndarray:
+    """A copy of the array that begins `offset` bytes after a multiple of 64; floats in `dtype`."""
+    kind = dtype if template.dtype.kind == "f" else template.dtype
+    n_bytes = template.size * np.dtype(kind).itemsize
+    room = np.zeros(n_bytes + 128, np.uint8)
+    start = (-room.ctypes.data) % 64 + offset
+    copy = room[start : start + n_bytes].view(kind).reshape(template.shape)
+    copy[...] = template
+    return copy
+
+
+def spoil(array: np.ndarray) -> None:
+    """Other values in the same array."""
+    array[...] = ~array if array.dtype == bool else array + 1
+
+
+def snapshot(built: Any) -> list[np.ndarray]:
+    """Copies of all arrays that an object holds."""
+    return [np.array(leaf) for leaf in jax.tree.leaves(built) if eqx.is_array(leaf)]

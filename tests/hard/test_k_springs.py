@@ -95,6 +95,7 @@ def answers(net, make, alive, k, l, x):
     return value, by_k, by_l, by_x, by_t, [b for b in bounds if b is not None], seen
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", EFFECTS.values(), ids=EFFECTS.keys())
 def test_k8_a_broken_spring_is_as_if_it_were_not_there(make):
     """Force, Jacobians, energy and every derivative are those of the net without it, whatever its constants, its length, and its law."""
@@ -144,6 +145,7 @@ def test_k8_a_broken_spring_may_be_out_of_range():
     assert not np.isfinite(springs.rounding(state)) or float(springs.rounding(state)) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stepper", [js.SymplecticEuler(), js.BackwardEuler()], ids=["symplectic", "backward"])
 def test_k8_nothing_acts_along_a_fused_spring(stepper):
     """Two nodes that fly apart keep 1 m/s when spring, damper and Rayleigh damping between them have fused."""

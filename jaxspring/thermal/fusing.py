@@ -101,16 +101,16 @@ class Fusing(Rule):
     def begin(self, state: State) -> State:
         """The state with a bit for every spring and, where springs come back, a rest length of every spring."""
         temperature_of(state, "Fusing")
-        if state.alive is None:
-            whole = self.net.own(jnp.ones(shape, bool) for shape in self.net.family_shapes)
-            state = dataclasses.replace(state, alive=whole)
-        elif not self.net.owns(state.alive):
+        alive = state.alive
+        if alive is None:
+            alive = self.net.own(jnp.ones(shape, bool) for shape in self.net.family_shapes)
+        elif not self.net.owns(alive):
             raise ValueError(
-                f"state.alive is of another net than Fusing: it tells about the springs of {state.alive.identity or 'no known net'}, and "
-                f"Fusing about those of {self.net.identity}. A state knows the broken springs of one net only: build both on it."
+                f"state.alive is of another net than Fusing: it tells about the springs of {alive.identity or 'no known net'}, and Fusing "
+                f"about those of {self.net.identity}. A state knows the broken springs of one net only: build both on it."
             )
         # The same kind of field as a step leaves it, also where it was made by hand.
-        state = dataclasses.replace(state, alive=self.net.own(state.alive.families))
+        state = dataclasses.replace(state, alive=self.net.own(alive.families))
         if self.refreezing is not None and self.springs is not None and state.rest_length is None:
             given = cast_inexact(self.springs.net.edge_field(self.springs.rest_length, "rest_length"), state.dtype)
             lengths = given.families if isinstance(given, EdgeField) else (given,) * len(self.net.family_shapes)

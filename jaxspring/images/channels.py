@@ -81,7 +81,9 @@ class Pixels:
         missing = self._missing(channel)
         values = self._on_background(values, channel, fill)
         if missing is not None and missing.any():
-            reason = "is masked" if self.nodata is None else f"is masked or holds the declared no-data value {self.nodata}"
+            parts = [] if self.mask is None else ["is masked"]
+            parts += [] if self.nodata is None else [f"holds the declared no-data value {self.nodata}"]
+            reason = " or ".join(parts)
             values = np.where(missing, _wanted(fill, missing, reason), values)
         if fill is not None and values.dtype.kind == "f":
             values = np.where(np.isfinite(values), values, np.asarray(fill, values.dtype))

@@ -33,7 +33,7 @@ from .reconstruction.constants import Constants, ConstantsSettings, fit_constant
 from .reconstruction.fitting import Reconstructed, SpringSettings, fit_springs
 
 CHECKPOINT = "checkpoint.npz"
-PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "equinox", "optax", "optimistix", "lineax", "diffrax", "matplotlib", "pillow")
+PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "equinox", "optax", "optimistix", "lineax", "diffrax", "matplotlib", "pillow", "tifffile")
 
 
 @dataclass(frozen=True)

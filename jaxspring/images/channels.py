@@ -91,7 +91,7 @@ class Pixels:
 
     def _missing(self, channel: Channel | Luminance | None) -> NDArray[Any] | None:
         """`(ny, nx)`: where a mask or the no-data number says that there is no value; None where nothing does."""
-        found = None
+        found: Any = None
         if self.mask is not None:
             found = self.mask if self.mask.ndim == 2 else channel(self.mask) if isinstance(channel, Channel) else self.mask.any(axis=-1)
         if self.nodata is not None:

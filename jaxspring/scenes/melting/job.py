@@ -121,7 +121,8 @@ class MeltRun:
 
     def seen(self) -> Frames:
         """The frames, ready to be drawn."""
-        return Frames(*self.frames, np.asarray(self.scene.net.edges))
+        time, points, temperatures, melted, alive = self.frames
+        return Frames(time, points, temperatures, melted, alive, np.asarray(self.scene.net.edges))
 
     def _write(self, path: pathlib.Path) -> None:
         arrays = {f"state/{name}": array for name, array in named_arrays(self.state).items()}

@@ -71,7 +71,7 @@ def picture(rows: list[dict], path: Path) -> None:
     axes.bar(place + 0.2, [r["ratio_best"] for r in rows], 0.4, label="heights by least squares")
     axes.axhline(1, color="0.4", linewidth=0.8)
     axes.set_xticks(place, [r["image"] for r in rows], rotation=30, ha="right")
-    axes.set(ylabel="rmse uniform / rmse fitted (1)", title="41 x 41 nodes, default settings")
+    axes.set(ylabel="rmse uniform / rmse fitted", title="41 x 41 nodes, default settings")
     axes.legend()
     figure.savefig(path, dpi=150)
 

@@ -7,6 +7,7 @@ Everything heavy is imported after the arguments are understood, so that `--help
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import pathlib
 import sys
@@ -36,6 +37,8 @@ class Arguments:
         iterations: updates of the parameters.
         out: folder for the results.
         resume: go on from a checkpoint.
+        fill: what stands where a pixel has no value, or None.
+        page: of a file with several, or None.
     """
 
     image: pathlib.Path | None
@@ -44,6 +47,8 @@ class Arguments:
     iterations: int
     out: pathlib.Path
     resume: bool
+    fill: float | None = None
+    page: int | None = None
 
 
 @dataclass(frozen=True)
@@ -54,11 +59,13 @@ class MeltArguments:
         nodes: along x, y and z, or None for the scene's own.
         duration: [s], or None for the scene's own.
         out: folder for the results.
+        resume: go on from a checkpoint.
     """
 
     nodes: tuple[int, int, int] | None
     duration: float | None
     out: pathlib.Path
+    resume: bool = False
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -80,12 +87,12 @@ def parse(argv: Sequence[str]) -> Arguments | MeltArguments:
     """Arguments as typed, checked. Ends the process with code 2 and one line where they make no sense."""
     given = _parser().parse_args(argv)
     if given.command == "melt":
-        return MeltArguments(given.nodes, given.duration, pathlib.Path(given.out))
+        return MeltArguments(given.nodes, given.duration, pathlib.Path(given.out), given.resume)
     image = None if given.image is None else pathlib.Path(given.image)
     out = pathlib.Path(given.out or f"jaxspring-{'elevation' if image is None else image.stem or 'image'}")
     usual = UPDATES_OF_STIFFNESS if given.parameters == ("stiffness",) else UPDATES_OF_CONSTANTS
     updates = usual if given.iterations is None else given.iterations
-    return Arguments(image, given.nodes, given.parameters, updates, out, given.resume)
+    return Arguments(image, given.nodes, given.parameters, updates, out, given.resume, given.fill, given.page)
 
 
 def run(arguments: Arguments) -> int:
@@ -119,6 +126,7 @@ def melt(arguments: MeltArguments) -> int:
         check_folder(arguments.out)
     except OSError as error:
         return complain(str(error), UNUSABLE)
+    from .archive import CheckpointError
     from .progress import Progress
     from .scenes.melting.job import melt as melted
     from .scenes.melting.scene import MeltSettings
@@ -129,11 +137,11 @@ def melt(arguments: MeltArguments) -> int:
     except ValueError as error:
         return complain(str(error), UNUSABLE)
     try:
-        outcome = melted(settings, arguments.out, Progress("melt"))
-    except (OSError, ImportError, MemoryError) as error:
+        outcome = melted(settings, arguments.out, Progress("melt"), arguments.resume)
+    except (CheckpointError, OSError, ImportError, MemoryError) as error:
         return complain(str(error) or "there is not enough memory.", UNUSABLE)
     if outcome.is_interrupted:
-        return complain("interrupted; no results were written.", INTERRUPTED)
+        return complain(f"interrupted after {outcome.frames} frames; the same command with --resume goes on.", INTERRUPTED)
     if outcome.failure:
         return complain(outcome.failure, FAILED)
     print(outcome.table)
@@ -165,7 +173,7 @@ def _load(arguments: Arguments):
 
     if arguments.image is None:
         return elevation_model()
-    return load_image(arguments.image, channel=Luminance())
+    return load_image(arguments.image, channel=Luminance(), fill=arguments.fill, page=arguments.page)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -201,6 +209,8 @@ def _parser() -> argparse.ArgumentParser:
         help=f"updates ({UPDATES_OF_STIFFNESS} of the stiffness, {UPDATES_OF_CONSTANTS} of constants)",
     )
     fit.add_argument("--out", metavar="DIR", help="folder for the results (jaxspring-<image>); an older result there is replaced")
+    fit.add_argument("--fill", type=number, metavar="VALUE", help="what stands where a pixel is no-data, masked, NaN or transparent")
+    fit.add_argument("--page", type=iterations, metavar="N", help="page of a TIFF, or frame of an animated PNG, from 0")
     fit.add_argument("--resume", action="store_true", help="go on from the checkpoint of an interrupted or finished run with the same DIR")
     _add_melt(commands)
     return parser
@@ -216,6 +226,7 @@ def _add_melt(commands: argparse._SubParsersAction) -> None:
     melting.add_argument("--nodes", type=block, metavar="NXxNYxNZ", help="particles of the block along x, y and z")
     melting.add_argument("--duration", type=seconds, metavar="S", help="simulated time in seconds")
     melting.add_argument("--out", metavar="DIR", default="jaxspring-melt", help="folder for the results; an older result there is replaced")
+    melting.add_argument("--resume", action="store_true", help="go on from the checkpoint of an interrupted run with the same DIR")
 
 
 def block(text: str) -> tuple[int, int, int]:
@@ -237,6 +248,17 @@ def seconds(text: str) -> float:
         value = -1.0
     if not 0.01 <= value <= 60:
         raise argparse.ArgumentTypeError(f"{text!r} is not a time from 0.01 to 60 seconds")
+    return value
+
+
+def number(text: str) -> float:
+    """A finite number."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a finite number")
     return value
 
 

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import pathlib
+import tempfile
 from typing import Any
 
 import jax
 import numpy as np
 
 from ._checks import has_shape
+from .archive import atomic_file
 from .state import State
+from .system import System
 from .topology.base import Topology
 from .topology.edge_field import EdgeField
 
@@ -24,8 +27,11 @@ def plot(
     length_unit: str = "m",
     axes: Any = None,
     limits: Any = None,
+    system: System | None = None,
 ) -> Any:
     """Draw the springs of a net; positions of 3 coordinates in perspective.
+
+    Broken springs (`state.alive`) are not drawn, and nodes that no spring holds are dots.
 
     Args:
         net: the topology.
@@ -35,6 +41,7 @@ def plot(
         length_unit: unit of the coordinates, for the labels.
         axes: matplotlib axes to draw on; None makes a new figure.
         limits: (D, 2) lowest and highest coordinate to show; None fits the picture.
+        system: draws the nodes that it holds in some coordinate as squares; None marks none.
 
     Returns:
         The matplotlib axes.
@@ -44,16 +51,21 @@ def plot(
         ValueError: a `color` that is not one number per spring; a state of several frames.
     """
     pyplot = _pyplot()
-    segments = _segments(net, state)
+    segments, alive = _segments(net, state), _alive(net, state)
+    nodes = _flat(state)
+    box = _limits(np.concatenate([segments.reshape(-1, segments.shape[-1]), nodes])) if limits is None else np.asarray(limits)
     if axes is None:
-        figure = pyplot.figure(layout="constrained")
+        figure = pyplot.figure(layout="constrained" if state.dim == 3 else "compressed")
         axes = figure.add_subplot(projection="3d") if state.dim == 3 else figure.add_subplot()
-    lines = _lines(segments, net, color)
+    lines = _lines(segments, alive, net, color)
     if state.dim == 3:
         axes.add_collection3d(lines)
     else:
         axes.add_collection(lines)
-    box = _limits(np.concatenate([segments.reshape(-1, segments.shape[-1]), _flat(state)])) if limits is None else np.asarray(limits)
+    loose = np.bincount(net.edges[alive].ravel(), minlength=net.n_nodes) == 0
+    for chosen, marker in ((loose, "o"), (_held(net, state, system), "s")):
+        if chosen.any():
+            axes.scatter(*nodes[chosen].T, s=12, marker=marker, color="black" if marker == "s" else "tab:gray")
     for i, name in enumerate(COORDINATES[: segments.shape[-1]]):
         getattr(axes, f"set_{name}lim")(*box[i])
         getattr(axes, f"set_{name}label")(f"{name} ({length_unit})")
@@ -67,22 +79,31 @@ def plot(
     return axes
 
 
-def animate(result: Any, net: Topology, path: str | pathlib.Path, frames_per_second: float = 20.0, length_unit: str = "m") -> pathlib.Path:
+def animate(
+    result: Any,
+    net: Topology,
+    path: str | pathlib.Path,
+    frames_per_second: float = 20.0,
+    length_unit: str = "m",
+    system: System | None = None,
+) -> pathlib.Path:
     """Write the saved frames of a run as an animated GIF; all frames share one scale.
 
     Args:
         result: of `rollout` with `save_every` (and no `observe`), or of `diffeqsolve` with `saveat`.
         net: the topology.
-        path: the file to write.
+        path: the file to write, `.gif`; it is replaced at the end, whole.
         frames_per_second: speed of the film [1/s].
         length_unit: unit of the coordinates, for the labels.
+        system: as in `plot`.
 
     Returns:
         The path.
 
     Raises:
         ImportError: matplotlib or Pillow is not installed.
-        ValueError: a result without saved states, or a state that is not finite.
+        ValueError: a result without saved states, a state that is not finite, or a path that is no `.gif`.
+        OSError: the folder is missing or cannot be written; said before anything is drawn.
     """
     pyplot = _pyplot()
     try:
@@ -95,18 +116,25 @@ def animate(result: Any, net: Topology, path: str | pathlib.Path, frames_per_sec
     if not isinstance(saved, State) or saved.position[0].ndim == len(net.node_shape):
         raise ValueError("animate needs the saved states of a run: call rollout(..., save_every=...) without `observe`.")
     path = pathlib.Path(path)
+    if path.suffix.lower() != ".gif":
+        raise ValueError(f"path = {str(path)!r}, but the film is a GIF: let the name end in .gif.")
     frames = [jax.tree.map(lambda a, i=i: a[i], saved) for i in range(saved.position[0].shape[0])]
     box = _limits(np.concatenate([_flat(frame) for frame in frames]))
     figure = pyplot.figure(layout="constrained")
     axes = figure.add_subplot(projection="3d") if saved.dim == 3 else figure.add_subplot()
     writer = PillowWriter(fps=max(round(frames_per_second), 1))
     try:
-        with writer.saving(figure, path, dpi=100):
+        # The writer takes a name that ends in .gif, and writes there whatever happens: so elsewhere first.
+        with atomic_file(path) as stream, tempfile.TemporaryDirectory() as folder:
+            film = pathlib.Path(folder) / "film.gif"
+            writer.setup(figure, film, dpi=100)
             for frame in frames:
                 axes.clear()
-                plot(net, frame, length_unit=length_unit, axes=axes, limits=box)
+                plot(net, frame, length_unit=length_unit, axes=axes, limits=box, system=system)
                 axes.set_title(f"t = {float(frame.time):.3g} s")
                 writer.grab_frame()
+            writer.finish()
+            stream.write(film.read_bytes())
     finally:
         pyplot.close(figure)
     return path
@@ -120,16 +148,30 @@ def _pyplot() -> Any:
     return pyplot
 
 
-def _lines(segments: np.ndarray, net: Topology, color: Any) -> Any:
+def _lines(segments: np.ndarray, alive: np.ndarray, net: Topology, color: Any) -> Any:
     from matplotlib.collections import LineCollection
     from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
     kind: Any = Line3DCollection if segments.shape[-1] == 3 else LineCollection
     if color is None:
-        return kind(segments, linewidths=1.0)
+        return kind(segments[alive], linewidths=1.0)
     flat = np.asarray(net.flatten(color) if isinstance(color, EdgeField) else color)
     has_shape("color", flat, {"one per spring": (net.n_springs,)})
-    return kind(segments, array=flat, linewidths=1.0)
+    return kind(segments[alive], array=flat[alive], linewidths=1.0)
+
+
+def _alive(net: Topology, state: State) -> np.ndarray:
+    """(E,) which springs are whole. A state that tells of the springs of another net says nothing of this one's."""
+    alive = state.alive
+    if alive is None or tuple(entry.shape for entry in alive.families) != net.family_shapes:
+        return np.ones(net.n_springs, bool)
+    return np.asarray(net.flatten(alive))
+
+
+def _held(net: Topology, state: State, system: System | None) -> np.ndarray:
+    """(N,) which nodes are held in some coordinate."""
+    masks = () if system is None else tuple(mask for mask in system.free_masks(state.dim) if mask is not None)
+    return np.any([~np.asarray(net.flatten_nodes(mask)) for mask in masks], axis=0) if masks else np.zeros(net.n_nodes, bool)
 
 
 def _segments(net: Topology, state: State) -> np.ndarray:

@@ -81,7 +81,9 @@ class Pixels:
         missing = self._missing(channel)
         values = self._on_background(values, channel, fill)
         if missing is not None and missing.any():
-            reason = "is masked" if self.nodata is None else f"is masked or holds the declared no-data value {self.nodata}"
+            parts = [] if self.mask is None else ["is masked"]
+            parts += [] if self.nodata is None else [f"holds the declared no-data value {self.nodata}"]
+            reason = " or ".join(parts)
             values = np.where(missing, _wanted(fill, missing, reason), values)
         if fill is not None and values.dtype.kind == "f":
             values = np.where(np.isfinite(values), values, np.asarray(fill, values.dtype))
@@ -89,7 +91,7 @@ class Pixels:
 
     def _missing(self, channel: Channel | Luminance | None) -> NDArray[Any] | None:
         """`(ny, nx)`: where a mask or the no-data number says that there is no value; None where nothing does."""
-        found = None
+        found: Any = None
         if self.mask is not None:
             found = self.mask if self.mask.ndim == 2 else channel(self.mask) if isinstance(channel, Channel) else self.mask.any(axis=-1)
         if self.nodata is not None:

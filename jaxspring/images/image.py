@@ -100,11 +100,16 @@ class Image(eqx.Module):
 
 
 def of_order_one(values: Array) -> Array:
-    """Values divided by the largest, so that neither their range nor the square of it leaves their type. For what no unit can change."""
-    # In two steps, since the reciprocal of the largest float32 is no normal number. The divisor counts as a constant: it cancels later.
+    """Values divided by a power of two, so that neither their range nor its square leaves their type. For what no unit can change."""
+    # In two steps, since the reciprocal of the largest float32 is no normal number.
     values = values / 16
-    size = jnp.max(jnp.abs(lax.stop_gradient(values)))
-    return values / jnp.where(size == 0, 1, size)
+    return values / power_of_two(jnp.max(jnp.abs(values)))
+
+
+def power_of_two(size: Array) -> Array:
+    """The power of two at or below each number, and 1/2 for zero: what is divided by it keeps all its digits. A constant to derivatives."""
+    _, exponent = jnp.frexp(lax.stop_gradient(size))
+    return jnp.ldexp(jnp.ones_like(size), exponent - 1)
 
 
 def _per_axis(name: str, value: PerAxis, dtype: jnp.dtype, must_be_positive: bool = False) -> tuple[Array, Array]:

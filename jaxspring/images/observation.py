@@ -20,14 +20,12 @@ from collections.abc import Callable, Sequence
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from .._arrays import given
 from .._checks import as_inexact, finite, has_shape
-from .image import Image
-from .image import Image, of_order_one
+from .image import Image, of_order_one, power_of_two
 from .smoothing import Length, smooth
 
 # One program instead of a dozen where a function is called outside `jit`; inside, it leaves no trace.
@@ -189,9 +187,8 @@ def _norm(x: Array, y: Array) -> Array:
 
 
 def _size(*parts: Array) -> Array:
-    """The largest absolute value among the parts, 1 where all are zero. What is divided and multiplied by it has no derivative from it."""
-    size = functools.reduce(jnp.maximum, [jnp.abs(lax.stop_gradient(part)) for part in parts])
-    return jnp.where(size == 0, 1, size)
+    """The largest absolute value among the parts, as a power of two."""
+    return power_of_two(functools.reduce(jnp.maximum, [jnp.abs(part) for part in parts]))
 
 
 def _guarded_sqrt(square: Array) -> Array:

@@ -27,7 +27,7 @@ class Surface(eqx.Module):
     """An image with its coefficients for one way of sampling, from `Image.surface`.
 
     The result has the floating type of the points, not of the pixels, so a float32 state stays float32. A coordinate that is NaN or
-    infinite gives NaN, and so does everything where a traced spacing is not positive or an origin not finite; any other coordinate
+    infinite gives NaN, and so does everything where a traced spacing is not positive; any other coordinate
     outside is clamped, however far.
     """
 
@@ -74,7 +74,7 @@ class Surface(eqx.Module):
         x, y = _points(x, y)
         column = _along(x, self.origin[0], self.spacing[0], self.shape[1])
         row = _along(y, self.origin[1], self.spacing[1], self.shape[0])
-        return (column, row), jnp.isfinite(x) & jnp.isfinite(y)
+        return (column, row), jnp.isfinite(x) & jnp.isfinite(y) & (column.spacing > 0) & (row.spacing > 0)
 
     def _block(self, column: _Along, row: _Along) -> list[list[Array]]:
         """The coefficients around each point, as `block[a][b]` along rows and columns."""

@@ -27,12 +27,13 @@ from ..inverse.checkpoint import Checkpoint
 from ..inverse.fit import Iteration
 from ..inverse.stopping import StopReason
 from ..progress import Stopwatch, draw_bar
+from .drawing import canvas_and_figure
 from .pictures import draw_pictures, triangle_corners
 from .reconstruction.constants import Constants, ConstantsSettings, fit_constants
 from .reconstruction.fitting import Reconstructed, SpringSettings, fit_springs
 
 CHECKPOINT = "checkpoint.npz"
-PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "equinox", "optax", "optimistix", "lineax", "diffrax", "matplotlib", "pillow")
+PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "equinox", "optax", "optimistix", "lineax", "diffrax", "matplotlib", "pillow", "tifffile")
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,9 @@ class Job:
             ImageError: the image is too small for a surface.
             CheckpointError: the checkpoint is damaged or of another problem.
             OSError: there is no checkpoint to go on from, or the folder cannot be written.
+            ImportError: what draws the pictures is not installed.
         """
+        canvas_and_figure()
         if min(self.image.shape) < 2:
             size = "{} x {}".format(*self.image.shape)
             raise ImageError(f"{self.name}: {size} pixels hold no surface; an image needs 2 x 2 at least.")

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..images.image import Image
+from .drawing import canvas_and_figure
 from .reconstruction.fitting import Reconstructed
 from .reconstruction.report import uniform_errors
 from .reconstruction.triangles import corners
@@ -25,30 +26,32 @@ def draw_pictures(folder: pathlib.Path, image: Image, found: Reconstructed) -> t
     Raises:
         ImportError: matplotlib is not installed.
     """
-    try:
-        # Not pyplot: it would choose a window system, and keep every figure.
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ImportError("Pictures need matplotlib: pip install jaxspring[viz]") from error
+    canvas, figure_of = canvas_and_figure()
     values = np.asarray(image.values, np.float64)
-    width = min(6.0, 4.5 * max(image.shape[1] / image.shape[0], 0.5))
+    left, right, bottom, top = _extent(image)
+    width = min(6.0, 4.5 * max((right - left) / (bottom - top), 0.5))
+    height = max(width * (bottom - top) / (right - left), 1.0) + 0.7  # inches, with title and labels
     uniform_sampled, uniform_best = uniform_errors(found.scene)[1:]
     surfaces = {
-        "uniform": (uniform_sampled, uniform_best),
-        "slides' law": (found.law.image_sampled, found.law.image_best),
-        "fitted": (found.fitted.image_sampled, found.fitted.image_best),
+        "uniform mesh": (uniform_sampled, uniform_best),
+        "start of the fit": (found.law.image_sampled, found.law.image_best),
+        "fitted mesh": (found.fitted.image_sampled, found.fitted.image_best),
     }
+
+    def figure(width: float, height: float) -> Any:
+        # "compressed" keeps panels of a fixed aspect, and their colour bar, together.
+        return figure_of((width, height), DPI, layout="compressed")
+
     drawings = {
-        "meshes.png": lambda: _meshes(Figure((3 * width, 5), DPI, layout="constrained"), image, values, found),
-        "reconstructions.png": lambda: _reconstructions(Figure((4 * width, 5), DPI, layout="constrained"), image, values, surfaces),
-        "errors.png": lambda: _errors(Figure((3 * width, 10), DPI, layout="constrained"), image, values, surfaces),
-        "loss.png": lambda: _loss(Figure((7, 4), DPI, layout="constrained"), found),
+        "meshes.png": lambda: _meshes(figure(3 * width, height), image, values, found),
+        "reconstructions.png": lambda: _reconstructions(figure(4 * width + 1, height), image, values, surfaces),
+        "errors.png": lambda: _errors(figure(3 * width + 1, 2 * height), image, values, surfaces),
+        "loss.png": lambda: _loss(figure_of((7, 4), DPI, layout="constrained"), found),
     }
     for name, draw in drawings.items():
-        figure = draw()
-        FigureCanvasAgg(figure)
-        figure.savefig(folder / name, metadata={"Software": None})
+        drawn = draw()
+        canvas(drawn)
+        drawn.savefig(folder / name, metadata={"Software": None})
     return tuple(drawings)
 
 
@@ -64,8 +67,10 @@ def _extent(image: Image) -> tuple[float, float, float, float]:
     return (ox - sx / 2, ox + (nx - 0.5) * sx, oy + (ny - 0.5) * sy, oy - sy / 2)
 
 
-def _label(axes: Any) -> None:
-    axes.set(xlabel="x (unit of the pixel spacing)", ylabel="y (unit of the pixel spacing)")
+def _label(axes: Any, image: Image) -> None:
+    # Where nobody gave a spacing, the unit is the pixel.
+    unit = "pixels" if all(float(spacing) == 1 for spacing in image.spacing) else "m"
+    axes.set(xlabel=f"x ({unit})", ylabel=f"y ({unit})")
     axes.label_outer()
 
 
@@ -78,7 +83,7 @@ def _meshes(figure: Any, image: Image, values: np.ndarray, found: Reconstructed)
         if mesh is not None:
             axes.triplot(np.ravel(mesh[0]), np.ravel(mesh[1]), triangle_corners(mesh[2]), color="tab:orange", linewidth=0.35)
         axes.set_title(title)
-        _label(axes)
+        _label(axes, image)
     return figure
 
 
@@ -87,22 +92,22 @@ def _reconstructions(figure: Any, image: Image, values: np.ndarray, surfaces: di
     for axes, (title, picture) in zip(figure.subplots(1, 4), panels, strict=True):
         axes.imshow(picture, cmap="gray", extent=_extent(image), vmin=values.min(), vmax=values.max())
         axes.set_title(title)
-        _label(axes)
-    figure.colorbar(figure.axes[0].images[0], ax=figure.axes, shrink=0.8, label="value (image's unit)")
+        _label(axes, image)
+    figure.colorbar(figure.axes[0].images[0], ax=figure.axes, label="value of the image", fraction=0.03, pad=0.01)
     return figure
 
 
 def _errors(figure: Any, image: Image, values: np.ndarray, surfaces: dict[str, tuple[np.ndarray, np.ndarray]]) -> Any:
     """Signed errors under both rules, all on one scale: the 99th percentile of the uniform mesh's."""
-    limit = float(np.percentile(np.abs(surfaces["uniform"][0] - values), 99)) or 1.0
+    limit = float(np.percentile(np.abs(surfaces["uniform mesh"][0] - values), 99)) or 1.0
     rows = figure.subplots(2, 3)
     for rule, (row, label) in enumerate(zip(rows, ("sampled", "best"), strict=True)):
         for axes, (name, pair) in zip(row, surfaces.items(), strict=True):
             error = pair[rule] - values
             axes.imshow(error, cmap="RdBu_r", extent=_extent(image), vmin=-limit, vmax=limit)
-            axes.set_title(f"{name}, {label}: rmse {np.sqrt(np.mean(error**2)):.4g}")
-            _label(axes)
-    figure.colorbar(figure.axes[0].images[0], ax=figure.axes, shrink=0.8, label="surface - image (image's unit)")
+            axes.set_title(f"{name}, {label} heights: rmse {np.sqrt(np.mean(error**2)):.4g}")
+            _label(axes, image)
+    figure.colorbar(figure.axes[0].images[0], ax=figure.axes, label="surface minus image", fraction=0.03, pad=0.01)
     return figure
 
 
@@ -110,7 +115,7 @@ def _loss(figure: Any, found: Reconstructed) -> Any:
     axes = figure.subplots()
     axes.plot(found.fit.history.loss, color="tab:blue")
     axes.axvline(found.fit.iteration, color="tab:orange", linewidth=0.8, label=f"lowest, iteration {found.fit.iteration}")
-    axes.set_xlabel("iteration (1)")
-    axes.set_ylabel("loss, log of the error (1)")
+    axes.set_xlabel("iteration")
+    axes.set_ylabel("loss (log of the error)")
     axes.legend()
     return figure

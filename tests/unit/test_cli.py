@@ -8,6 +8,7 @@ import subprocess
 import sys
 
 import numpy as np
+import PIL.Image
 import pytest
 
 from jaxspring import cli
@@ -58,6 +59,8 @@ def complaint(arguments, capsys):
         (["fit", "--iterations", "-1"], "'-1' is not a whole number"),
         (["fit", "--parameters", "stifness"], "stifness is not among stiffness"),
         (["fit", "--parameters", ""], "is not among"),
+        (["fit", "--fill", "nan"], "'nan' is not a finite number"),
+        (["fit", "--page", "-1"], "expected one argument|is not a whole number"),
         (["fit", "--iteration", "3"], "unrecognized arguments: --iteration"),
         (["fit", "a.png", "b.png"], "unrecognized arguments: b.png"),
     ],
@@ -148,6 +151,18 @@ def test_folders_that_cannot_be_used_get_one_line_and_code_2(hill, capsys):
     assert "other files, which would be lost" in complaint(["fit", hill, "--out", "other"], capsys)
     assert "there is no checkpoint" in complaint(["fit", hill, "--resume"], capsys)
     assert sorted(os.listdir()) == [hill, "other"]
+
+
+def test_transparent_pixels_are_refused_and_the_option_named(folder, capsys):
+    """A picture with transparent pixels is not read by its hidden colours: the line names the pixel and --fill."""
+    pixels = np.full((8, 8, 2), 255, np.uint8)
+    pixels[2, 5, 1] = 0
+    PIL.Image.fromarray(pixels).save("logo.png")
+    line = complaint(["fit", "logo.png"], capsys)
+    assert "pixel [2, 5] is transparent" in line
+    assert "--fill" in line
+    filled = cli._load(cli.parse(["fit", "logo.png", "--fill", "-3.5"])).values
+    np.testing.assert_array_equal(filled, np.where(pixels[..., 1] == 0, -3.5, 255.0))
 
 
 # A whole run

@@ -3,6 +3,7 @@
 import json
 import math
 import signal
+import sys
 
 import jax
 import numpy as np
@@ -50,7 +51,7 @@ def test_bad_settings_are_named(field, value):
 @pytest.mark.slow
 def test_a_small_block(tmp_path, capsys, monkeypatch):
     """A small block gives the whole folder; nothing is below the floor, the ledger closes, and the lowest layer melts. Interrupted runs
-    leave it as it is.
+    leave it as it is, and go on.
     """
     out = tmp_path / "out"
     run = ["melt", "--nodes", "3x3x3", "--duration", "0.15", "--out", str(out)]
@@ -70,10 +71,13 @@ def test_a_small_block(tmp_path, capsys, monkeypatch):
 
 
 def check_interrupts(run, out, capsys, monkeypatch):
-    """Ctrl-C in the middle of a run, or while pictures are drawn, ends with code 130 and one line; the older result stays as it was."""
+    """Ctrl-C in the middle of a run, or while pictures are drawn, ends with code 130 and one line; the older result stays as it was, a
+    checkpoint is beside it, and --resume ends in the same numbers as the unbroken run.
+    """
     older = {path: path.read_bytes() for path in out.iterdir()}
+    checkpoint = out.with_name("out.checkpoint.npz")
 
-    def interrupted_in(module, name, is_time):
+    def interrupted_in(module, name, is_time, frames):
         usual = getattr(module, name)
 
         def interrupt(*given, **named):
@@ -84,12 +88,58 @@ def check_interrupts(run, out, capsys, monkeypatch):
         monkeypatch.setattr(module, name, interrupt)
         assert main(run) == cli.INTERRUPTED
         monkeypatch.setattr(module, name, usual)
-        assert capsys.readouterr().err.splitlines()[-1] == "jaxspring: interrupted; no results were written."
-        assert list(out.parent.iterdir()) == [out]
+        line = f"jaxspring: interrupted after {frames} frames; the same command with --resume goes on."
+        assert capsys.readouterr().err.splitlines()[-1] == line
+        assert sorted(out.parent.iterdir()) == [out, checkpoint]
         assert {path: path.read_bytes() for path in out.iterdir()} == older
 
-    interrupted_in(js.progress, "draw_bar", lambda label, done, total: done >= total / 2)
-    interrupted_in(js.scenes.melting.job, "draw_strip", lambda *_: True)
+    def resumed():
+        with monkeypatch.context() as patch:
+            patch.setattr(js.scenes.melting.job, "draw_animation", lambda path, *_: path.touch())  # the slowest part
+            assert main([*run, "--resume"]) == 0
+        assert not checkpoint.exists()
+        reports = [json.loads(text) for text in (older[out / "report.json"], (out / "report.json").read_text())]
+        for report in reports:
+            del report["seconds"]
+        assert reports[0] == reports[1]
+        older.update({path: path.read_bytes() for path in out.iterdir()})
+        capsys.readouterr()
+
+    interrupted_in(js.progress, "draw_bar", lambda label, done, total: done >= total / 2, 30)
+    assert main([*run, "--duration", "0.2", "--resume"]) == cli.UNUSABLE
+    assert "its problem is" in capsys.readouterr().err
+    resumed()
+    interrupted_in(js.scenes.melting.job, "draw_strip", lambda *_: True, 60)
+    resumed()
+    check_full_disk(run, out, capsys, monkeypatch)
+
+
+def check_full_disk(run, out, capsys, monkeypatch):
+    """Where the results cannot be written, the code is 1, the line says so, and the run is kept."""
+
+    def full(*_):
+        raise OSError("No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(js.scenes.melting.job, "draw_strip", full)
+        assert main(run) == cli.FAILED
+    assert "could not be written (No space left on device); --resume" in capsys.readouterr().err
+    assert out.with_name("out.checkpoint.npz").exists()
+    assert main([*run[:-1], str(out.with_name("never")), "--resume"]) == cli.UNUSABLE
+    assert "there is no checkpoint" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", [["melt"], ["fit", "--nodes", "3x3"]])
+@pytest.mark.parametrize("missing", ["matplotlib.figure", "PIL.Image"])
+def test_what_draws_is_asked_for_before_the_work(command, missing, tmp_path, capsys, monkeypatch):
+    """Without matplotlib or Pillow both commands end at once, with code 2 and the name of the extra; nothing is computed or written."""
+    np.save(tmp_path / "hill.npy", np.arange(30.0).reshape(5, 6))
+    monkeypatch.setitem(sys.modules, missing, None)
+    monkeypatch.setattr(js.scenes.melting.job, "rollout", None)
+    image = [str(tmp_path / "hill.npy")] if command[0] == "fit" else []
+    assert main([*command, *image, "--out", str(tmp_path / "out")]) == cli.UNUSABLE
+    assert "pip install jaxspring[viz]" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["hill.npy"]
 
 
 @pytest.mark.slow

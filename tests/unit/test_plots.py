@@ -1,7 +1,9 @@
 """Pictures: what is drawn is where the springs are."""
 
+import dataclasses
 import sys
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib import pyplot
@@ -56,6 +58,27 @@ def test_a_spring_across_a_period_is_short():
     np.testing.assert_allclose(lengths, 1.0)
 
 
+@pytest.mark.parametrize("dim", [2, 3])
+def test_broken_springs_are_not_drawn(dim, rng):
+    """Only whole springs are lines, with their own colours; a node that no spring holds is a dot, a held one a square."""
+    net, state = sheet(dim, rng)
+    alive = ~(net.edges == 0).any(axis=1)
+    alive[3] = False
+    state = dataclasses.replace(state, alive=net.split(jnp.asarray(alive)))
+    free = np.ones((12, dim), bool)
+    free[5, 0] = free[7, 1] = False
+    axes = plot(net, state, color=np.arange(net.n_springs), system=js.System(net, 1.0, free=free))
+    lines, dots, squares = axes.collections
+    segments = np.asarray(lines._segments3d) if dim == 3 else np.asarray(lines.get_segments())
+    np.testing.assert_allclose(segments, np.asarray(state.points)[net.edges[alive]], atol=1e-12)
+    np.testing.assert_array_equal(lines.get_array(), np.arange(net.n_springs)[alive])
+    for marks, nodes in ((dots, [0]), (squares, [5, 7])):
+        shown = np.stack(marks._offsets3d, -1) if dim == 3 else marks.get_offsets()
+        np.testing.assert_allclose(shown, np.asarray(state.points)[nodes], atol=1e-12)
+    other = js.lattice((3, 4))
+    assert len(plot(other, state).collections[0].get_segments() if dim == 2 else plot(other, state).collections[0]._segments3d) == 17
+
+
 def test_axes_of_the_user_are_drawn_on(rng):
     """Given axes are used and returned."""
     net, state = sheet(2, rng)
@@ -88,6 +111,15 @@ def test_what_cannot_be_drawn(rng, tmp_path):
     many = js.rollout(system, state, js.SymplecticEuler(), 0.1, 2, save_every=1).saved
     with pytest.raises(ValueError, match="one state"):
         plot(net, many)
+    with pytest.raises(ValueError, match=r"end in \.gif"):
+        animate(dataclasses.replace(result, saved=many), net, tmp_path / "run.mp4")
+    with pytest.raises(FileNotFoundError, match="no folder"):
+        animate(dataclasses.replace(result, saved=many), net, tmp_path / "none" / "run.gif")
+    (tmp_path / "run.gif").write_bytes(b"older")
+    broken = dataclasses.replace(many, position=many.position * np.array([1.0, np.nan])[:, None, None])
+    with pytest.raises(ValueError, match="NaN"):
+        animate(dataclasses.replace(result, saved=broken), net, tmp_path / "run.gif")
+    assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("run.gif", b"older")]
 
 
 def test_without_matplotlib_the_error_names_the_extra(rng, monkeypatch):

@@ -1,6 +1,6 @@
 """The command `jaxspring melt`: run the scene, check it, and write report, pictures and animation.
 
-The folder appears at the end, whole.
+The folder appears at the end, whole. Until then there is a checkpoint beside it, from which a later call goes on to the same bits.
 """
 
 from __future__ import annotations
@@ -16,14 +16,16 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from ...archive import atomic_folder
+from ...archive import atomic_folder, read_archive, write_archive
+from ...files import expect_same, named_arrays, restored
 from ...progress import Progress, Stopwatch
-from ...rollouts import Result, rollout
+from ...rollouts import rollout
 from ...state import State
-from ...status import Flag
+from ...status import Status
 from ...steppers.explicit import SymplecticEuler
 from ...thermal.fusing import melted_fraction
 from ...thermal.ledger import Ledger, energy_ledger
+from ..drawing import canvas_and_figure
 from .pictures import draw_animation, draw_strip
 from .scene import Melting, MeltSettings, melting_block
 
@@ -35,12 +37,14 @@ class MeltOutcome:
     """How a run ended.
 
     Attributes:
-        is_interrupted: by Ctrl-C; nothing was written.
+        is_interrupted: by Ctrl-C; there is a checkpoint to go on from.
+        frames: how many were done.
         failure: one line, or empty where the folder was written.
         table: what happened, for the terminal.
     """
 
     is_interrupted: bool = False
+    frames: int = 0
     failure: str = ""
     table: str = ""
 
@@ -54,12 +58,16 @@ class Frames:
         points: (T, N, 3) [m].
         temperatures: (T, N) [K].
         melted: (T,) share of the particles that no spring holds.
+        alive: (T, E) which springs hold.
+        edges: (E, 2) which particles they join.
     """
 
     time: np.ndarray
     points: np.ndarray
     temperatures: np.ndarray
     melted: np.ndarray
+    alive: np.ndarray
+    edges: np.ndarray
 
 
 class _Look(eqx.Module):
@@ -68,44 +76,120 @@ class _Look(eqx.Module):
     net: Any
 
     def __call__(self, state: State) -> tuple[Any, ...]:
-        return state.time, state.points, state.temperatures, melted_fraction(self.net, state)
+        alive = self.net.flatten(state.alive)
+        return state.time, state.points, state.temperatures, melted_fraction(self.net, state), alive
 
 
-def run_melting(scene: Melting, settings: MeltSettings, progress: Progress | None = None) -> tuple[Result, Frames]:
-    """Run the scene for its duration, in steps of at most its dt; keep `FRAMES` frames, or as many as there are steps, and the start."""
-    every = math.ceil(settings.n_steps / FRAMES)
-    n_steps = every * min(FRAMES, settings.n_steps)
-    dt = settings.duration / n_steps  # so that equal frames fill the duration
-    look = _Look(scene.net)
-    result = rollout(scene.system, scene.state, SymplecticEuler(), dt, n_steps, save_every=every, observe=look, progress=progress)
-    frames = jax.tree.map(lambda a, b: np.concatenate([np.asarray(a)[None], np.asarray(b)]), look(scene.state), result.saved)
-    return result, Frames(*frames)
+class MeltRun:
+    """A run in parts of equal numbers of frames, which can be kept and taken up.
+
+    Every part starts from the state alone, so that a run that was taken up goes through the very same programs as an unbroken one.
+
+    Attributes:
+        state: where the run is.
+        frames: what was seen until now, the start included.
+        status: of all parts.
+        effects: names for the status.
+    """
+
+    def __init__(self, scene: Melting, settings: MeltSettings):
+        self.scene, self.settings = scene, settings
+        self.n_frames = min(FRAMES, settings.n_steps)
+        self.every = math.ceil(settings.n_steps / FRAMES)
+        self.dt = settings.duration / (self.every * self.n_frames)  # so that equal frames fill the duration
+        self.part = 3 if self.n_frames == FRAMES else 1
+        self.state = scene.system.prepare(scene.state.dtype).begin(scene.state)
+        self.status, self.effects = Status.ok(), ()
+        self.frames = jax.tree.map(lambda a: np.asarray(a)[None], _Look(scene.net)(self.state))
+
+    @property
+    def done(self) -> int:
+        """Frames done, besides the start."""
+        return len(self.frames[0]) - 1
+
+    def go_on(self, progress: Progress | None = None, keep: pathlib.Path | None = None) -> None:
+        """To the end, or to the first trouble; what was done is kept in a file after every part."""
+        look, n_steps = _Look(self.scene.net), self.every * self.part
+        while self.done < self.n_frames and bool(self.status.is_ok):
+            part = rollout(self.scene.system, self.state, SymplecticEuler(), self.dt, n_steps, save_every=self.every, observe=look)
+            self.frames = jax.tree.map(lambda a, b: np.concatenate([a, np.asarray(b)]), self.frames, part.saved)
+            self.state, self.status, self.effects = part.state, self.status.then(part.status), part.effects
+            if keep is not None and bool(self.status.is_ok):
+                self._write(keep)
+            if progress is not None:
+                progress.update(self.done, self.n_frames)
+
+    def seen(self) -> Frames:
+        """The frames, ready to be drawn."""
+        time, points, temperatures, melted, alive = self.frames
+        return Frames(time, points, temperatures, melted, alive, np.asarray(self.scene.net.edges))
+
+    def _write(self, path: pathlib.Path) -> None:
+        arrays = {f"state/{name}": array for name, array in named_arrays(self.state).items()}
+        arrays |= {f"frames/{i}": array for i, array in enumerate(self.frames)}
+        write_archive(path, arrays, self._about())
+
+    def read(self, path: pathlib.Path) -> None:
+        """Take up what an earlier run kept.
+
+        Raises:
+            CheckpointError: the file is damaged, or of other settings.
+            OSError: there is no such file.
+        """
+        archive = read_archive(path)
+        expect_same(path, "problem", archive.about, self._about())
+        arrays = {part: {n.partition("/")[2]: a for n, a in archive.arrays.items() if n.startswith(part)} for part in ("state/", "frames/")}
+        self.state = restored(path, arrays["state/"], self.state)
+        self.frames = tuple(arrays["frames/"][str(i)] for i in range(len(self.frames)))
+
+    def _about(self) -> dict[str, Any]:
+        return {"kind": "melt", "settings": json.loads(json.dumps(asdict(self.settings))), "dtype": str(self.scene.state.dtype)}
 
 
-def melt(settings: MeltSettings, out: pathlib.Path, progress: Progress | None = None) -> MeltOutcome:
-    """Run, check and write.
+def melt(settings: MeltSettings, out: pathlib.Path, progress: Progress | None = None, resume: bool = False) -> MeltOutcome:
+    """Run, check and write; or go on from where an earlier call was interrupted.
 
     Raises:
-        OSError: the folder cannot be written.
-        ImportError: matplotlib is not installed.
+        OSError: there is no checkpoint to go on from, or none can be written.
+        CheckpointError: the checkpoint is damaged or of other settings.
+        ImportError: what draws the pictures is not installed.
     """
+    canvas_and_figure()
     clock = Stopwatch()
-    scene = melting_block(settings)
-    result, frames = run_melting(scene, settings, progress)
-    if bool(result.status.has(Flag.INTERRUPTED)):
-        return MeltOutcome(is_interrupted=True)
-    if not bool(result.status.is_ok):
-        return MeltOutcome(failure=f"the run failed: {result.status.describe(result.effects)}.")
-    seconds = {"run": clock.seconds, **seconds_per_effect(scene, result.state)}
-    report = report_of(scene, settings, result.state, frames, seconds)
+    run = MeltRun(melting_block(settings), settings)
+    place = out.absolute().with_name(out.absolute().name + ".checkpoint.npz")
+    if resume:
+        if not place.exists():
+            raise FileNotFoundError(f"--resume: there is no checkpoint of {out}; run without --resume first.")
+        run.read(place)
+    try:
+        run.go_on(progress, place)
+        return _finish(run, out, place, clock)
+    except KeyboardInterrupt:
+        if run.done == 0:
+            raise
+        return MeltOutcome(is_interrupted=True, frames=run.done)
+
+
+def _finish(run: MeltRun, out: pathlib.Path, place: pathlib.Path, clock: Stopwatch) -> MeltOutcome:
+    """Check, and fill the folder, all or nothing."""
+    scene, settings, frames = run.scene, run.settings, run.seen()
+    if not bool(run.status.is_ok):
+        return MeltOutcome(frames=run.done, failure=f"the run failed: {run.status.describe(run.effects)}.")
+    seconds = {"run": clock.seconds, **seconds_per_effect(scene, run.state)}
+    report = report_of(scene, settings, run.state, frames, seconds)
     lowest = report["lowest_particle_m"]
     if lowest < -1e-6 * settings.spacing:
-        return MeltOutcome(failure=f"a particle is {-lowest:.3g} m below the floor.")
-    with atomic_folder(out) as folder:
-        draw_strip(folder / "strip.png", frames, settings)
-        draw_animation(folder / "melting.gif", frames, settings)
-        (folder / "report.json").write_text(json.dumps(report, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    return MeltOutcome(table=table(report))
+        return MeltOutcome(frames=run.done, failure=f"a particle is {-lowest:.3g} m below the floor.")
+    try:
+        with atomic_folder(out) as folder:
+            draw_strip(folder / "strip.png", frames, settings)
+            draw_animation(folder / "melting.gif", frames, settings)
+            (folder / "report.json").write_text(json.dumps(report, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    except OSError as error:
+        return MeltOutcome(frames=run.done, failure=f"the results could not be written ({error}); --resume tries again without a new run.")
+    place.unlink(missing_ok=True)
+    return MeltOutcome(frames=run.done, table=table(report))
 
 
 def report_of(scene: Melting, settings: MeltSettings, end: State, frames: Frames, seconds: dict[str, float]) -> dict[str, Any]:
@@ -170,4 +254,4 @@ def _fastest(call: Any, arguments: tuple[Any, ...], repeats: int) -> float:
     return min(spent)
 
 
-__all__ = ["Frames", "MeltOutcome", "exchanged", "melt", "report_of", "run_melting", "seconds_per_effect", "table"]
+__all__ = ["Frames", "MeltOutcome", "MeltRun", "exchanged", "melt", "report_of", "seconds_per_effect", "table"]

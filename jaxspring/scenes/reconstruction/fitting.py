@@ -6,11 +6,14 @@ follows its gradient; every 25 iterations each cell may change its diagonal. At 
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import equinox as eqx
+import numpy as np
 
 from ...images.image import Image
 from ...inverse.checkpoint import Checkpoint
@@ -115,11 +118,20 @@ def fit_springs(
     settings = SpringSettings() if settings is None else settings
     loss, carried = prepare_springs(image, settings)
     start = loss.springs.zero()
+    if checkpoint is not None:
+        checkpoint = dataclasses.replace(checkpoint, note=f"{checkpoint.note}, start {_digest(loss.springs.log_law)}")
     law, _ = settle(loss, start, carried)
     optimiser = Adam(settings.learning_rate, settings.momentum, decay_over=settings.n_iterations)
     found = fit(loss, start, optimiser, settings.n_iterations, on_iteration, carried, None, None, checkpoint, resume, progress)
     mesh, status = settle(loss, found.parameters, found.best_carried)
     return compare(loss.error, law, mesh, found, status)
+
+
+def _digest(log_law: Any) -> str:
+    """Of the stiffness that the variables are relative to. Its last digits decide into which of many states at rest the law's mesh falls,
+    so another machine or version can start elsewhere: there a checkpoint's variables would mean other springs.
+    """
+    return hashlib.sha256(np.ascontiguousarray(log_law).data).hexdigest()[:16]
 
 
 def compare(error: SurfaceError, law: Carried, mesh: Carried, found: Fit, status: Status) -> Reconstructed:

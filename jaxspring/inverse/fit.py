@@ -17,10 +17,12 @@ import numpy as np
 from ..progress import Progress, Stopwatch
 from ..status import Flag, Status
 from .checkpoint import Checkpoint, Snapshot, read_checkpoint, write_checkpoint
+from .determined import Undetermined, from_jacobian, from_zeros, slopes
+from .explain import Seen, explanation
 from .iteration import Objective, Report, first_memory, iterate, prepare, refuse_invalid, warn_of_zero_gradients
 from .optimisers import as_optimiser
 from .stopping import Stop, StopReason
-from .transforms import to_free, transform_per_leaf
+from .transforms import to_constrained, to_free, transform_per_leaf
 
 PyTree = Any
 
@@ -53,8 +55,10 @@ class Fit:
         carried: what the loss handed on last (None without).
         info: what else the loss returned last (None without).
         best_carried: what the loss handed on at its lowest (None without).
-        status: NONFINITE, INVALID or INTERRUPTED, with the iteration as its step; see `raise_for_status`.
+        status: NONFINITE, INVALID, INTERRUPTED or the warning UNDETERMINED, with the iteration as its step; see `raise_for_status`.
         reason: why it ended.
+        undetermined: what the data leave open, see `Undetermined`; None where nothing is known to be.
+        explanation: the status in words.
     """
 
     parameters: PyTree
@@ -67,6 +71,8 @@ class Fit:
     best_carried: PyTree
     status: Status
     reason: StopReason
+    undetermined: Undetermined | None
+    explanation: str
 
 
 @dataclass(frozen=True)
@@ -159,7 +165,7 @@ def fit(
         start = read_checkpoint(checkpoint, start, coordinates)
     run = _Run(objective, optimiser, start, coordinates, checkpoint)
     reason = run.to_end(n_iterations, stop or Stop(), on_iteration, progress, clock)
-    return run.result(reason)
+    return run.result(reason, trained)
 
 
 class _Run:
@@ -167,7 +173,9 @@ class _Run:
 
     def __init__(self, objective: Objective, optimiser: Any, start: Snapshot, coordinates: str, checkpoint: Checkpoint | None):
         self.objective, self.optimiser, self.coordinates, self.checkpoint = objective, optimiser, coordinates, checkpoint
-        self.now = start  # what a resumed fit would start from
+        self.now = start  # where the next evaluation starts
+        self.done: Snapshot | None = None  # where the last evaluation started, which a resumed fit would do again
+        self.first, self.report, self.zeros = start.parameters, None, None
         self.history = start.history
         self.best, self.best_iteration, self.last = start.best, start.best_iteration, start.parameters
         self.status, self.info, self.carried, self.best_carried = Status.ok(), None, start.carried, start.best_carried
@@ -194,15 +202,35 @@ class _Run:
             self._save()
         return reason
 
-    def result(self, reason: StopReason) -> Fit:
+    def result(self, reason: StopReason, started: PyTree) -> Fit:
         """The outcome, in the user's coordinates."""
+        undetermined = self._undetermined(reason, started)
+        self.status = self.status.then(Status.when(Flag.UNDETERMINED, undetermined is not None, step=self.best_iteration))
         value = self.history["loss"][self.best_iteration] if self.best_iteration >= 0 else float("nan")
         back = self.objective.parameters
         history = History(*(np.asarray(self.history[name]) for name in ("loss", "gradient_norm", "seconds")))
         last, best = (self.carried, self.info), self.best_carried
         if not self.objective.has_carried:
             last, best = (None, None), None
-        return Fit(back(self.best), back(self.last), value, self.best_iteration, history, *last, best, self.status, reason)
+        words = "OK" if int(self.status.flags) == 0 else explanation(self.status, self._seen(), undetermined)
+        values = (back(self.best), back(self.last), value, self.best_iteration, history, *last, best)
+        return Fit(*values, self.status, reason, undetermined, words)
+
+    def _undetermined(self, reason: StopReason, started: PyTree) -> Undetermined | None:
+        """What the data leave open: by the Jacobian of least squares, else by gradients that were always zero."""
+        if self.report is None or reason is StopReason.FAILED:
+            return None
+        linear = self.optimiser.linearised(self.objective, self.best, self.report.memory, self.now.carried)
+        if linear is None:
+            return from_zeros(self.zeros) if len(self.history["loss"]) > 1 else None
+        residuals, jacobian = map(np.asarray, linear)
+        transforms = self.objective.transforms
+        return from_jacobian(jacobian, residuals, started, to_constrained(transforms, self.best), slopes(transforms, self.best))
+
+    def _seen(self) -> Seen:
+        index = len(self.history["loss"]) - 1
+        bad = () if self.report is None else self.report.checks.bad_gradients
+        return Seen(self.objective, self.last, self.now.carried, index, self.history["loss"][index], bad)
 
     def _advance(self) -> Report:
         watch = Stopwatch()
@@ -211,7 +239,9 @@ class _Run:
         index = self.now.iteration
         checks = report.checks
         if index == 0:
-            warn_of_zero_gradients(self.now.parameters, checks.is_zero)
+            warn_of_zero_gradients(checks.zeros)
+        self.report, self.done = report, self.now
+        self.zeros = checks.zeros if self.zeros is None else jax.tree.map(np.logical_and, self.zeros, checks.zeros)
         self.history["loss"].append(float(checks.value))
         self.history["gradient_norm"].append(float(checks.gradient_norm))
         self.history["seconds"].append(watch.seconds)

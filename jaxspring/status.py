@@ -63,7 +63,7 @@ EXPLANATION = {
     Flag.PRECISION: "rounding of such large coordinates spoils the springs' forces; move the scene to the origin, or use float64",
     Flag.SOLVER: "the solver gave up: its solve did not reach the accuracy it needs, or its step shrank to the least allowed",
     Flag.UNSTABLE: "the forces balance, but the shape is no minimum of the energy: a small push makes it buckle; start from one",
-    Flag.UNDETERMINED: "the data leave some of the parameters open, whose values rest on where the fit started; fix or tie them, or add data",
+    Flag.UNDETERMINED: "the data leave some of the parameters open; fix or tie them, or add data",
     Flag.INVALID: "a parameter has a value that its constructor would refuse (sign, NaN or infinity)",
 }
 

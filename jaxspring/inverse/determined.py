@@ -66,7 +66,8 @@ def from_jacobian(jacobian: np.ndarray, residuals: np.ndarray, start: PyTree, be
     Args:
         jacobian: (R, P) derivatives by the unconstrained coordinates, in the order of the raveled leaves.
         residuals: (R,).
-        start, best: parameters at the start and now, in the user's coordinates.
+        start: parameters at the start, in the user's coordinates.
+        best: parameters now.
         slopes: derivative of each parameter by its unconstrained coordinate.
     """
     eps = float(np.finfo(jacobian.dtype).eps)

@@ -16,9 +16,10 @@ import numpy as np
 
 from ..progress import Progress, Stopwatch
 from ..status import Flag, Status
-from .checkpoint import Checkpoint, Snapshot, read_checkpoint, write_checkpoint
+from .checkpoint import Checkpoint, Snapshot, expect_same_loss, read_checkpoint, write_checkpoint
 from .determined import Undetermined, from_jacobian, from_zeros, slopes
 from .explain import Seen, explanation
+from .fingerprint import fingerprint
 from .iteration import Objective, Report, first_memory, iterate, prepare, refuse_invalid, warn_of_zero_gradients
 from .optimisers import as_optimiser
 from .stopping import Stop, StopReason
@@ -160,10 +161,11 @@ def fit(
     carried = jax.tree.map(_as_array, carried)
     empty = {"loss": [], "gradient_norm": [], "seconds": []}
     start = Snapshot(free, free, first_memory(objective, optimiser, free, carried), carried, carried, 0, -1, empty)
-    coordinates = "; ".join(map(str, chosen))
+    identity = {"coordinates": "; ".join(map(str, chosen)), "optimiser": fingerprint(optimiser)}
+    known_loss = None
     if resume and checkpoint is not None:
-        start = read_checkpoint(checkpoint, start, coordinates)
-    run = _Run(objective, optimiser, start, coordinates, checkpoint)
+        start, known_loss = read_checkpoint(checkpoint, start, identity)
+    run = _Run(objective, optimiser, start, identity, checkpoint, known_loss)
     reason = run.to_end(n_iterations, stop or Stop(), on_iteration, progress, clock)
     return run.result(reason, trained)
 
@@ -171,11 +173,20 @@ def fit(
 class _Run:
     """The host's side of a fit: what changes from iteration to iteration."""
 
-    def __init__(self, objective: Objective, optimiser: Any, start: Snapshot, coordinates: str, checkpoint: Checkpoint | None):
-        self.objective, self.optimiser, self.coordinates, self.checkpoint = objective, optimiser, coordinates, checkpoint
+    def __init__(
+        self,
+        objective: Objective,
+        optimiser: Any,
+        start: Snapshot,
+        identity: dict[str, Any],
+        checkpoint: Checkpoint | None,
+        known_loss: float | None,
+    ):
+        self.objective, self.optimiser, self.identity, self.checkpoint = objective, optimiser, identity, checkpoint
+        self.known_loss = known_loss  # what the first evaluation must give where this goes on from a checkpoint
         self.now = start  # where the next evaluation starts
         self.done: Snapshot | None = None  # where the last evaluation started, which a resumed fit would do again
-        self.first, self.report, self.zeros = start.parameters, None, None
+        self.report, self.zeros = None, None
         self.history = start.history
         self.best, self.best_iteration, self.last = start.best, start.best_iteration, start.parameters
         self.status, self.info, self.carried, self.best_carried = Status.ok(), None, start.carried, start.best_carried
@@ -190,9 +201,9 @@ class _Run:
                 if progress is not None:
                     progress.update(min(len(self.history["loss"]) - 1, n_iterations), n_iterations)
                 if reason is None:
-                    self.now = self._next(report)
-                    if self.checkpoint is not None and self.now.iteration % self.checkpoint.every == 0:
+                    if self.checkpoint is not None and self.now.iteration and self.now.iteration % self.checkpoint.every == 0:
                         self._save()
+                    self.now = self._next(report)
         except KeyboardInterrupt:
             if not self.history["loss"]:
                 raise
@@ -238,6 +249,9 @@ class _Run:
         report = eqx.tree_at(lambda r: r.checks, report, jax.device_get(report.checks))
         index = self.now.iteration
         checks = report.checks
+        if self.checkpoint is not None and self.known_loss is not None:
+            expect_same_loss(self.checkpoint, float(checks.value), self.known_loss, checks.value.dtype)
+            self.known_loss = None
         if index == 0:
             warn_of_zero_gradients(checks.zeros)
         self.report, self.done = report, self.now
@@ -280,9 +294,9 @@ class _Run:
         return Snapshot(report.after, self.best, report.memory, report.carried, self.best_carried, done, self.best_iteration, self.history)
 
     def _save(self) -> None:
-        """Write what the next iteration starts from; an evaluation that was not followed by an update is done again on resuming."""
-        if self.checkpoint is not None:
-            write_checkpoint(self.checkpoint, self.now, self.coordinates)
+        """Write where the last evaluation started, and what it gave: it is done again on resuming, to see that the loss is the same."""
+        if self.checkpoint is not None and self.done is not None:
+            write_checkpoint(self.checkpoint, self.done, self.identity)
 
 
 def _as_array(leaf: Any) -> Any:

@@ -253,8 +253,8 @@ def _named(method: str) -> Iterator[None]:
     except Exception as error:
         raise TypeError(
             f"The optimiser's own {method} failed ({type(error).__name__}: {error}). fit gives it the parameters that are trained, the "
-            "gradient of the whole loss, and value, grad, value_fn, obj_fn and grad_fn by name; optimisers that want other parameters, other "
-            "arguments, gradients per example or a state that changes its structure cannot be used. Use Adam(), LBFGS() or e.g. "
+            "gradient of the whole loss, and value, grad, value_fn, obj_fn and grad_fn by name. Optimisers that want other parameters or "
+            "arguments, gradients per example, or a state that changes its structure cannot be used. Use Adam(), LBFGS() or, e.g., "
             "optax.adamw(0.01)."
         ) from error
 

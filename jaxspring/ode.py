@@ -14,9 +14,11 @@ from typing import TYPE_CHECKING, Any, get_origin
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from ._checks import finite, is_concrete
+from .events import on_states
 from .state import State
 from .status import Flag, Status
 from .system import System
@@ -56,6 +58,8 @@ class OdeResult(eqx.Module):
         times: [s], in the structure of `saveat`; infinite in slots that were not reached.
         status: what went wrong, if anything; see `raise_for_status`.
         info: facts about the run.
+        event: booleans in the structure of the event's conditions: which one ended the run, at `state.time`. All are False where the
+            run came to t1 or failed; None without an event.
         effects: names of the system's forces, for messages (static).
     """
 
@@ -64,6 +68,7 @@ class OdeResult(eqx.Module):
     times: Any
     status: Status
     info: OdeInfo
+    event: Any
     effects: tuple[str, ...] = eqx.field(static=True)
 
     def at(self, time: Any) -> State:
@@ -86,6 +91,7 @@ def diffeqsolve(
     adjoint: diffrax.AbstractAdjoint | None = None,
     progress_meter: diffrax.AbstractProgressMeter | None = None,
     max_steps: int | None = 4096,
+    event: diffrax.Event | None = None,
 ) -> OdeResult:
     """Solve a system from `state.time` to `t1` by a diffrax solver: explicit, implicit or semi-implicit.
 
@@ -101,6 +107,10 @@ def diffeqsolve(
         adjoint: how derivatives are taken; `diffrax.RecursiveCheckpointAdjoint()` (reverse mode) unless said.
         progress_meter: e.g. `diffrax.TqdmProgressMeter()`.
         max_steps: most steps to try.
+        event: a `diffrax.Event`, which ends the run early. Its conditions are called as cond_fn(time, state, system). A boolean ends the
+            run at the end of the step; a number that changes its sign ends it at the zero, to the tolerance of the event's `root_finder`
+            (without one at the end of the step, whose time has no derivative by the parameters). With a root finder the final state and
+            its time are differentiable. A number that is zero at the start counts as crossed when it comes back. t1 may be infinite.
 
     Returns:
         An `OdeResult`. Trouble is in its status, never an exception: NONFINITE, MAX_STEPS, SOLVER; call `raise_for_status(result)`.
@@ -119,7 +129,7 @@ def diffeqsolve(
     import diffrax
 
     solver = diffrax.Tsit5() if solver is None else solver
-    _check_times(state, t1, dt0)
+    _check_times(state, t1, dt0, may_be_infinite=event is not None)
     if system.rules:
         names = ", ".join(type(rule).__name__ for rule in system.rules)
         raise ValueError(f"{names} acts after steps of fixed length, which an adaptive solver does not take. Use rollout.")
@@ -133,7 +143,9 @@ def diffeqsolve(
     meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
     if isinstance(adjoint, diffrax.BacksolveAdjoint) and saveat is not None:
         raise ValueError("BacksolveAdjoint knows the last state only: leave out saveat, or use another adjoint.")
-    return _solve(system, state, t1, solver, dt0, saveat, stepsize_controller, adjoint, meter, max_steps)
+    if isinstance(adjoint, diffrax.BacksolveAdjoint) and event is not None:
+        raise ValueError("BacksolveAdjoint cannot go back over an event. Leave the adjoint out, or use DirectAdjoint or ForwardMode.")
+    return _solve(system, state, t1, solver, dt0, saveat, stepsize_controller, adjoint, meter, max_steps, event)
 
 
 @eqx.filter_jit
@@ -148,6 +160,7 @@ def _solve(
     adjoint: Any,
     meter: Any,
     max_steps: int | None,
+    event: Any,
 ) -> OdeResult:
     import diffrax
 
@@ -156,20 +169,23 @@ def _solve(
     start = ready.constrain(dataclasses.replace(state, neighbours=None))
     before = begin(system, ready, Carry(start, None, jnp.zeros((), jnp.int32)), jnp.zeros((), state.dtype), None)
     end = diffrax.SubSaveAt(t1=True)
+    scene = _Scene(ready, dataclasses.replace(start, position=None, velocity=None))
+    y0 = (start.position, start.velocity)
     solution = diffrax.diffeqsolve(
         _terms(ready, start, solver),
         solver,
         start.time,
         t1,
         dt0,
-        (start.position, start.velocity),
-        args=_Scene(ready, dataclasses.replace(start, position=None, velocity=None)),
+        y0,
+        args=scene,
         saveat=diffrax.SaveAt(subs=end) if saveat is None else _with_end(saveat, end),
         stepsize_controller=controller,
         adjoint=adjoint,
         max_steps=max_steps,
         throw=False,
         progress_meter=meter,
+        event=None if event is None else on_states(event, _as_state, _flow, (start.time, y0, scene), t1),
     )
     found: Any = solution
     times, frames = (found.ts, found.ys) if saveat is None else (found.ts[1], found.ys[1])
@@ -183,6 +199,7 @@ def _solve(
         times=None if saveat is None else found.ts[0],
         status=jax.lax.stop_gradient(status),
         info=OdeInfo(n_steps, n_accepted, n_rejected, solution.result, solution.interpolation),
+        event=solution.event_mask,
         effects=system.effects,
     )
 
@@ -270,13 +287,14 @@ def _verdict(result: Any, n_steps: Array) -> Status:
 
     codes = diffrax.RESULTS
     too_long = (result == codes.max_steps_reached) | (result == codes.max_steps_rejected)
-    gave_up = (result != codes.successful) & ~too_long
+    gave_up = (result != codes.successful) & (result != codes.event_occurred) & ~too_long
     return Status.when(Flag.MAX_STEPS, too_long, step=n_steps).then(Status.when(Flag.SOLVER, gave_up, step=n_steps))
 
 
-def _check_times(state: State, t1: Any, dt0: Any) -> None:
+def _check_times(state: State, t1: Any, dt0: Any, *, may_be_infinite: bool) -> None:
     for name, value in (("t1", t1), ("dt0", dt0)):
-        if value is not None and is_concrete(value):
+        is_endless = name == "t1" and may_be_infinite and is_concrete(value) and np.all(np.isinf(value))
+        if value is not None and is_concrete(value) and not is_endless:
             finite(name, value)
     if dt0 is None or not all(is_concrete(value) for value in (state.time, t1, dt0)):
         return

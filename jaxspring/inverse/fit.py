@@ -14,6 +14,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from ..numerics import is_traced
 from ..progress import Progress, Stopwatch
 from ..status import Flag, Status
 from .checkpoint import Checkpoint, Snapshot, expect_same_loss, read_checkpoint, write_checkpoint
@@ -151,6 +152,7 @@ def fit(
     True
     """
     _check_numbers(n_iterations, resume, checkpoint)
+    _check_kinds(loss, parameters, on_iteration, stop, checkpoint)
     clock = Stopwatch()
     optimiser = as_optimiser(optimiser)
     trained, rest = prepare(parameters)
@@ -161,7 +163,8 @@ def fit(
     carried = jax.tree.map(_as_array, carried)
     empty = {"loss": [], "gradient_norm": [], "seconds": []}
     start = Snapshot(free, free, first_memory(objective, optimiser, free, carried), carried, carried, 0, -1, empty)
-    identity = {"coordinates": "; ".join(map(str, chosen)), "optimiser": fingerprint(optimiser)}
+    settings = {name: value for name, value in fingerprint(optimiser).items() if name not in optimiser.may_change}
+    identity = {"coordinates": "; ".join(map(str, chosen)), "optimiser": settings}
     known_loss = None
     if resume and checkpoint is not None:
         start, known_loss = read_checkpoint(checkpoint, start, identity)
@@ -246,6 +249,7 @@ class _Run:
     def _advance(self) -> Report:
         watch = Stopwatch()
         report = iterate(self.objective, self.optimiser, self.now.parameters, self.now.memory, self.now.carried)
+        _refuse_traced("what the loss reads", report.checks)
         report = eqx.tree_at(lambda r: r.checks, report, jax.device_get(report.checks))
         index = self.now.iteration
         checks = report.checks
@@ -276,9 +280,10 @@ class _Run:
         asked = None
         if on_iteration is not None:
             norm = float(checks.gradient_norm)
-            asked = on_iteration(
-                Iteration(index, loss, norm, clock.seconds, is_best, report.info, report.carried, self.objective, report.at)
-            )
+            told = Iteration(index, loss, norm, clock.seconds, is_best, report.info, report.carried, self.objective, report.at)
+            asked = on_iteration(told)
+            if asked is not None and np.ndim(asked):
+                raise TypeError(f"on_iteration returned {type(asked).__name__} of shape {np.shape(asked)}; expected True to end, or None.")
         if not usable:
             return StopReason.FAILED
         if asked:
@@ -311,3 +316,24 @@ def _check_numbers(n_iterations: int, resume: bool, checkpoint: Checkpoint | Non
         raise ValueError(f"n_iterations = {n_iterations}; expected zero or more.")
     if resume and checkpoint is None:
         raise ValueError("resume=True needs to know from where: pass checkpoint=Checkpoint(path).")
+
+
+def _check_kinds(loss: Any, parameters: PyTree, on_iteration: Any, stop: Any, checkpoint: Any) -> None:
+    if not callable(loss):
+        raise TypeError(f"loss is a {type(loss).__name__}; expected a function of the parameters: fit(loss, parameters).")
+    if on_iteration is not None and not callable(on_iteration):
+        raise TypeError(f"on_iteration is a {type(on_iteration).__name__}; expected a function of an `Iteration`.")
+    if stop is not None and not isinstance(stop, Stop):
+        raise TypeError(f"stop is a {type(stop).__name__}; expected Stop(target=..., gradient_norm=..., ...).")
+    if checkpoint is not None and not isinstance(checkpoint, Checkpoint):
+        raise TypeError(f"checkpoint is a {type(checkpoint).__name__}; expected Checkpoint(path, every=25).")
+    _refuse_traced("parameters", parameters)
+
+
+def _refuse_traced(what: str, tree: PyTree) -> None:
+    """TypeError where `fit` itself is called inside a transformation of JAX."""
+    if is_traced(tree):
+        raise TypeError(
+            f"fit was called inside jit, grad or vmap: {what} hold traced values. It decides on the host after each iteration; call it "
+            "outside. For the derivative of a fitted parameter by the data use the implicit function theorem on the gradient of the loss."
+        )

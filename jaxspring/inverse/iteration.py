@@ -133,7 +133,7 @@ def prepare(parameters: PyTree) -> tuple[PyTree, PyTree]:
         return leaf
 
     trained, rest = eqx.partition(jax.tree_util.tree_map_with_path(convert, parameters), eqx.is_inexact_array)
-    if not jax.tree.leaves(trained):
+    if not any(leaf.size for leaf in jax.tree.leaves(trained)):
         raise ValueError("parameters hold no floating-point array, so that there is nothing to train. Convert integers to floats.")
     return trained, rest
 

@@ -8,8 +8,9 @@ from __future__ import annotations
 import abc
 import contextlib
 import inspect
+import math
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -52,6 +53,9 @@ class Evaluation(eqx.Module):
 
 class Optimiser(eqx.Module):
     """How parameters are improved. Abstract; `Adam`, `LBFGS`, `LeastSquares`, or any optax transformation."""
+
+    # Settings that a resumed fit may change; any other is refused there.
+    may_change: ClassVar[frozenset[str]] = frozenset()
 
     @abc.abstractmethod
     def init(self, objective: Objective, free: PyTree, carried: PyTree) -> PyTree:
@@ -109,16 +113,24 @@ class Adam(Optimiser):
     Attributes:
         learning_rate: of the first iteration, in unconstrained coordinates (static).
         b1: decay of the mean gradient per iteration (static).
-        decay_over: iterations over which the rate falls; None keeps it (static).
+        decay_over: iterations over which the rate falls; None keeps it (static). A resumed fit may change it, to go on for longer.
         last_fraction: what is left of the rate then (static).
 
     Source: optax.adam, optax.cosine_decay_schedule.
     """
 
+    may_change: ClassVar[frozenset[str]] = frozenset({"decay_over"})
+
     learning_rate: float = eqx.field(static=True, default=0.05)
     b1: float = eqx.field(static=True, default=0.9)
     decay_over: int | None = eqx.field(static=True, default=None)
     last_fraction: float = eqx.field(static=True, default=0.05)
+
+    def __check_init__(self):
+        _expect("learning_rate", self.learning_rate, self.learning_rate > 0, "a positive number")
+        _expect("b1", self.b1, 0 <= self.b1 < 1, "zero or more, and less than one")
+        _expect("decay_over", self.decay_over, self.decay_over is None or self.decay_over >= 1, "1 or more iterations, or None")
+        _expect("last_fraction", self.last_fraction, self.last_fraction >= 0, "zero or more")
 
     def init(self, objective: Objective, free: PyTree, carried: PyTree) -> PyTree:
         """Mean gradient, mean square, count."""
@@ -150,6 +162,10 @@ class LBFGS(Optimiser):
     memory_size: int = eqx.field(static=True, default=10)
     max_line_search_steps: int = eqx.field(static=True, default=20)
 
+    def __check_init__(self):
+        for name in ("memory_size", "max_line_search_steps"):
+            _expect(name, getattr(self, name), getattr(self, name) >= 1, "1 or more")
+
     def init(self, objective: Objective, free: PyTree, carried: PyTree) -> PyTree:
         """The state of optax.lbfgs."""
         return self._optax().init(objective, free, carried)
@@ -177,6 +193,10 @@ class LeastSquares(Optimiser):
     rtol: float = eqx.field(static=True, default=1e-8)
     atol: float = eqx.field(static=True, default=1e-8)
     by_reverse_mode: bool = eqx.field(static=True, default=False)
+
+    def __check_init__(self):
+        for name in ("rtol", "atol"):
+            _expect(name, getattr(self, name), getattr(self, name) >= 0, "zero or more")
 
     def init(self, objective: Objective, free: PyTree, carried: PyTree) -> PyTree:
         """Arrays of the solver's state."""
@@ -212,11 +232,10 @@ class LeastSquares(Optimiser):
     def _fresh(self, objective: Objective, free: PyTree, carried: PyTree) -> Any:
         solver, options = self._solver()
         residual, aux = jax.eval_shape(objective, free, carried)
-        _check_residuals(residual)
+        _check_residuals(residual, free)
         state = solver.init(objective, free, carried, options, residual, aux, frozenset())
         # The damping starts as a float of JAX's own width; it must not widen the parameters.
-        narrowest = min((leaf.dtype for leaf in jax.tree.leaves(free)), key=lambda dtype: jnp.finfo(dtype).bits)
-        return eqx.tree_at(lambda s: s.search_state, state, cast_inexact(state.search_state, narrowest))
+        return eqx.tree_at(lambda s: s.search_state, state, cast_inexact(state.search_state, jax.tree.leaves(free)[0].dtype))
 
 
 def as_optimiser(optimiser: Any) -> Optimiser:
@@ -236,6 +255,12 @@ def as_optimiser(optimiser: Any) -> Optimiser:
     is_uncalled = isinstance(optimiser, type) or inspect.isroutine(optimiser)
     what = f"{optimiser.__name__} itself, which was not called" if is_uncalled else f"a {type(optimiser).__name__}"
     raise TypeError(f"optimiser is {what}; expected an optax transformation such as optax.sgd(0.1), or Adam(), LBFGS(), LeastSquares().")
+
+
+def _expect(name: str, value: Any, is_right: bool, expected: str) -> None:
+    """ValueError where a setting is not what it must be; NaN never is."""
+    if not is_right or (isinstance(value, float) and not math.isfinite(value)):
+        raise ValueError(f"{name} = {value}; expected {expected}.")
 
 
 def _asked_for(update: Callable[..., Any], extra: dict[str, Any]) -> dict[str, Any]:
@@ -259,13 +284,17 @@ def _named(method: str) -> Iterator[None]:
         ) from error
 
 
-def _check_residuals(residuals: PyTree) -> None:
-    """TypeError where a loss for least squares returns anything but real floating-point arrays."""
+def _check_residuals(residuals: PyTree, free: PyTree) -> None:
+    """TypeError where the residuals are no real arrays of the parameters' one type; ValueError where there are none."""
+    dtypes = sorted({str(leaf.dtype) for leaf in jax.tree.leaves(free)})
+    if len(dtypes) > 1:
+        raise TypeError(f"The parameters are of {' and '.join(dtypes)}; least squares needs one type. Cast them, e.g. by astype(float).")
     leaves = jax.tree_util.tree_leaves_with_path(residuals)
     for path, leaf in leaves:
-        if not (hasattr(leaf, "dtype") and leaf.dtype in (jnp.float32, jnp.float64)):
+        found = str(getattr(leaf, "dtype", type(leaf).__name__))
+        if found != dtypes[0]:
             name = f" at {leaf_name(path)}" if path else ""
-            raise TypeError(f"loss returned residuals of {getattr(leaf, 'dtype', type(leaf).__name__)}{name}; expected float32 or float64.")
+            raise TypeError(f"loss returned residuals of {found}{name}, but the parameters are {dtypes[0]}; expected the same. Cast one.")
     if sum(leaf.size for _, leaf in leaves) == 0:
         raise ValueError("loss returned no residuals; expected an array, or a tree of arrays, with at least one entry.")
 
@@ -280,11 +309,17 @@ def _loose() -> Iterator[None]:
 def _value_and_grad(objective: Objective, free: PyTree, carried: PyTree) -> Any:
     def scalar(point: PyTree) -> Any:
         value, rest = objective(point, carried)
-        if jnp.shape(value) != () or not jnp.issubdtype(jnp.result_type(value), jnp.floating):
-            raise TypeError(
-                f"loss returned {jax.tree.map(jnp.shape, value)} of {jnp.result_type(value)}; expected one real number. "
-                "For an array of residuals pass optimiser=LeastSquares(); for more results use `carried`."
-            )
-        return value, rest
+        return one_number(value), rest
 
     return jax.value_and_grad(scalar, has_aux=True)(free)
+
+
+def one_number(value: Any) -> Array:
+    """What a loss returned as a 0-d array; TypeError where it is not one real floating-point number."""
+    advice = "For residuals pass optimiser=LeastSquares() to fit; for more results use its `carried`."
+    if not eqx.is_array_like(value):
+        what = "nothing (None)" if value is None else f"a {type(value).__name__}"
+        raise TypeError(f"loss returned {what}; expected one real number. {advice}")
+    if jnp.shape(value) != () or not jnp.issubdtype(jnp.result_type(value), jnp.floating):
+        raise TypeError(f"loss returned {jnp.shape(value)} of {jnp.result_type(value)}; expected one real number. {advice}")
+    return jnp.asarray(value, jnp.result_type(value))

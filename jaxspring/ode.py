@@ -19,6 +19,8 @@ from jaxtyping import Array
 
 from ._checks import finite, is_concrete
 from .events import on_states
+from .forces.fluid import Fluid
+from .numerics import linear_call
 from .state import State
 from .status import Flag, Status
 from .system import System
@@ -75,6 +77,12 @@ class OdeResult(eqx.Module):
         """The state at any time [s] between the start and the end; needs `saveat=diffrax.SaveAt(dense=True)`."""
         if self.info.interpolation is None:
             raise ValueError("this result keeps no interpolation. Pass saveat=diffrax.SaveAt(dense=True) to diffeqsolve.")
+        times = (self.info.interpolation.t0, self.info.interpolation.t1)
+        if all(is_concrete(value) for value in (time, *times)):
+            low, high = sorted(float(value) for value in times)
+            slack = float(jnp.finfo(self.state.dtype).eps) * max(abs(low), abs(high))
+            if not np.all((np.asarray(time) >= low - slack) & (np.asarray(time) <= high + slack)):
+                raise ValueError(f"time = {time} lies outside this run, which went from {float(times[0])} to {float(times[1])}.")
         time = jnp.asarray(time, self.state.dtype)
         position, velocity = self.info.interpolation.evaluate(time)
         return self.state.moved(position, velocity, time)
@@ -129,10 +137,15 @@ def diffeqsolve(
     import diffrax
 
     solver = diffrax.Tsit5() if solver is None else solver
+    _check_options(solver, saveat, stepsize_controller, adjoint, progress_meter, max_steps, event)
     _check_times(state, t1, dt0, may_be_infinite=event is not None)
-    if system.rules:
-        names = ", ".join(type(rule).__name__ for rule in system.rules)
-        raise ValueError(f"{names} acts after steps of fixed length, which an adaptive solver does not take. Use rollout.")
+    # A fluid's list of neighbours changes no result; whatever else acts after a step would be left out.
+    rules = [type(part).__name__ for _, part in system.followers if not isinstance(part, Fluid)]
+    if rules:
+        raise ValueError(
+            f"{', '.join(rules)}: this acts after steps of fixed length, which an adaptive solver does not take. Use rollout, or leave it "
+            "out of the system (an event= can end a run at a contact)."
+        )
     t1 = jnp.asarray(t1, state.dtype)
     dt0 = None if dt0 is None else jnp.asarray(dt0, state.dtype)
     if stepsize_controller is None:
@@ -145,7 +158,15 @@ def diffeqsolve(
         raise ValueError("BacksolveAdjoint knows the last state only: leave out saveat, or use another adjoint.")
     if isinstance(adjoint, diffrax.BacksolveAdjoint) and event is not None:
         raise ValueError("BacksolveAdjoint cannot go back over an event. Leave the adjoint out, or use DirectAdjoint or ForwardMode.")
-    return _solve(system, state, t1, solver, dt0, saveat, stepsize_controller, adjoint, meter, max_steps, event)
+    try:
+        return _solve(system, state, t1, solver, dt0, saveat, stepsize_controller, adjoint, meter, max_steps, event)
+    except TypeError as error:
+        if "forward-mode" not in str(error):
+            raise
+        raise TypeError(
+            f"{type(adjoint).__name__} takes derivatives in reverse mode only, and this is forward mode (jvp, jacfwd, linearize, hessian). "
+            "Pass adjoint=diffrax.ForwardMode() for jvp and jacfwd, or diffrax.DirectAdjoint(), which takes both modes, for hessian."
+        ) from error
 
 
 @eqx.filter_jit
@@ -188,6 +209,8 @@ def _solve(
         event=None if event is None else on_states(event, _as_state, _flow, (start.time, y0, scene), t1),
     )
     found: Any = solution
+    if isinstance(adjoint, diffrax.ForwardMode):
+        found = eqx.tree_at(lambda s: (s.ts, s.ys), solution, _forward_only((solution.ts, solution.ys)))
     times, frames = (found.ts, found.ys) if saveat is None else (found.ts[1], found.ys[1])
     last = _as_state(times[0], jax.tree.map(lambda a: a[0], frames), _Scene(ready, start))
     names = ("num_steps", "num_accepted_steps", "num_rejected_steps")
@@ -201,6 +224,29 @@ def _solve(
         info=OdeInfo(n_steps, n_accepted, n_rejected, solution.result, solution.interpolation),
         event=solution.event_mask,
         effects=system.effects,
+    )
+
+
+def _forward_only(tree: Any) -> Any:
+    """The tree, whose derivative in reverse mode is an error that says so."""
+    arrays, rest = eqx.partition(tree, eqx.is_inexact_array)
+    return eqx.combine(_marked(arrays), rest)
+
+
+@jax.custom_jvp
+def _marked(arrays: Any) -> Any:
+    return arrays
+
+
+@_marked.defjvp
+def _marked_jvp(primals: Any, tangents: Any) -> Any:
+    return primals[0], linear_call(lambda _, tangent: tangent, _refuse_reverse, None, tangents[0])
+
+
+def _refuse_reverse(_: Any, cotangent: Any) -> Any:
+    raise TypeError(
+        "ForwardMode takes derivatives in forward mode only (jvp, jacfwd), and this is reverse mode (grad, jacrev). Leave the adjoint out, "
+        "or pass diffrax.DirectAdjoint(), which takes both modes."
     )
 
 
@@ -289,6 +335,26 @@ def _verdict(result: Any, n_steps: Array) -> Status:
     too_long = (result == codes.max_steps_reached) | (result == codes.max_steps_rejected)
     gave_up = (result != codes.successful) & (result != codes.event_occurred) & ~too_long
     return Status.when(Flag.MAX_STEPS, too_long, step=n_steps).then(Status.when(Flag.SOLVER, gave_up, step=n_steps))
+
+
+def _check_options(solver: Any, saveat: Any, controller: Any, adjoint: Any, meter: Any, max_steps: Any, event: Any) -> None:
+    """TypeError where an option is of another kind, such as a class that was not called."""
+    import diffrax
+
+    kinds = {
+        "solver": (solver, diffrax.AbstractSolver, "diffrax.Tsit5()"),
+        "saveat": (saveat, diffrax.SaveAt, "diffrax.SaveAt(ts=...)"),
+        "stepsize_controller": (controller, diffrax.AbstractStepSizeController, "diffrax.PIDController(rtol=1e-6, atol=1e-6)"),
+        "adjoint": (adjoint, diffrax.AbstractAdjoint, "diffrax.DirectAdjoint()"),
+        "progress_meter": (meter, diffrax.AbstractProgressMeter, "diffrax.TqdmProgressMeter()"),
+        "event": (event, diffrax.Event, "diffrax.Event(lambda time, state, system: state.position.y[0], optimistix.Newton(1e-8, 1e-8))"),
+    }
+    for name, (value, kind, example) in kinds.items():
+        if value is not None and not isinstance(value, kind):
+            what = f"the class {value.__name__}, not called" if isinstance(value, type) else f"a {type(value).__name__}"
+            raise TypeError(f"{name} is {what}; expected a diffrax object such as {example}, or None.")
+    if max_steps is not None and (isinstance(max_steps, bool) or not isinstance(max_steps, (int, np.integer)) or max_steps < 1):
+        raise ValueError(f"max_steps = {max_steps!r}; expected a whole number of 1 or more, or None for no limit.")
 
 
 def _check_times(state: State, t1: Any, dt0: Any, *, may_be_infinite: bool) -> None:

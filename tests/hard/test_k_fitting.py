@@ -47,6 +47,7 @@ def optax_optimisers():
                 if isinstance(made, optax.GradientTransformation):
                     yield name, made
     yield "lookahead", optax.lookahead(optax.sgd(0.1), 5, 0.5)
+    yield "schedule_free", optax.contrib.schedule_free(optax.sgd(0.1), 0.1)
     yield "MultiSteps", optax.MultiSteps(optax.adam(0.1), 2)
     yield "multi_transform", optax.multi_transform({"x": optax.adam(0.1), "y": optax.set_to_zero()}, {"a": "x", "b": "y"})
     yield "apply_if_finite", optax.apply_if_finite(optax.lbfgs(), 3)
@@ -164,7 +165,7 @@ def test_no_alarm_where_the_data_determine_all():
     data = 3.0 * TIMES + 0.1 * jnp.sin(9.0 * TIMES)
 
     def residuals(p):
-        return p["slope"] * TIMES + p["offset"] + 1e-6 * (p["stiffness"] - 2e4) * TIMES**2 - data
+        return p["slope"] * TIMES + p["offset"] + 1e-4 * (p["stiffness"] - 2e4) * TIMES**2 - data
 
     found = js.fit(residuals, {"slope": 1.0, "offset": 0.0, "stiffness": 1e4}, js.LeastSquares(), 100)
     assert found.undetermined is None
@@ -219,7 +220,7 @@ def test_a_loss_that_leaves_its_domain_says_which_step():
     [
         (lambda p: (bowl(p), 1), "loss returned a tuple; expected one real number"),
         (lambda p: None, r"loss returned nothing \(None\)"),
-        (lambda p: 1j * bowl(p), r"loss returned \(\) of complex128"),
+        (lambda p: bowl(p).astype(complex), r"loss returned \(\) of complex128"),
         (lambda p: jnp.round(bowl(p)).astype(int), r"loss returned \(\) of int64"),
         (3.0, "loss is a float; expected a function"),
     ],
@@ -286,7 +287,7 @@ def fall(height, gravity, speed=0.0, direction=None, **options):
     state = js.State.from_points(net, jnp.stack([zero, height])[None], velocities=jnp.stack([zero, speed + zero])[None])
     system = js.System(net, 1.0, js.Gravity(jnp.stack([zero, -gravity])))
     ground = diffrax.Event({"ground": height_of_the_ball, "far": is_far}, optimistix.Newton(1e-6, 1e-6), direction)
-    return js.diffeqsolve(system, state, jnp.inf, dt0=0.1, max_steps=64, event=ground, **options)
+    return js.diffeqsolve(system, state, jnp.inf, diffrax.Bosh3(), 0.1, max_steps=64, event=ground, **options)
 
 
 def height_of_the_ball(time, state):
@@ -303,8 +304,13 @@ def is_far(time, state, system):
 def test_a_ball_hits_the_ground():
     """Time sqrt(2 h / g), speed sqrt(2 g h), the right event named, and dt/dh = 1 / sqrt(2 g h), dt/dg = -sqrt(h / 2) g^-1.5."""
     h, g = jnp.asarray(10.0), jnp.asarray(9.81)
-    (time, found), slopes = jax.value_and_grad(lambda h, g: (lambda r: (r.state.time, r))(fall(h, g)), (0, 1), has_aux=True)(h, g)
-    assert float(time) == pytest.approx(np.sqrt(20 / 9.81), rel=1e-12)
+
+    def time_and_result(h, g):
+        found = fall(h, g, adjoint=diffrax.ForwardMode())
+        return found.state.time, found
+
+    slopes, found = jax.jacfwd(time_and_result, (0, 1), has_aux=True)(h, g)
+    assert float(found.state.time) == pytest.approx(np.sqrt(20 / 9.81), rel=1e-12)
     assert float(found.state.velocity.y[0]) == pytest.approx(-np.sqrt(2 * 9.81 * 10), rel=1e-12)
     assert {name: bool(hit) for name, hit in found.event.items()} == {"ground": True, "far": False}
     assert int(found.status.flags) == 0
@@ -338,15 +344,14 @@ def test_wrong_conditions_are_named(condition, kind, words):
     ("adjoint", "mode", "words"),
     [
         (None, jax.jacfwd, r"RecursiveCheckpointAdjoint takes derivatives in reverse mode only.*adjoint=diffrax.ForwardMode\(\)"),
-        (None, jax.hessian, "diffrax.DirectAdjoint"),
         (diffrax.BacksolveAdjoint(), jax.jacfwd, "BacksolveAdjoint takes derivatives in reverse mode only"),
         (diffrax.ForwardMode(), jax.grad, "ForwardMode takes derivatives in forward mode only"),
         (diffrax.DirectAdjoint(), jax.hessian, None),
     ],
-    ids=["default jacfwd", "default hessian", "backsolve jacfwd", "forward grad", "direct hessian"],
+    ids=["default jacfwd", "backsolve jacfwd", "forward grad", "direct hessian"],
 )
 def test_the_mode_that_an_adjoint_lacks_is_named(adjoint, mode, words):
-    """Each adjoint in the mode that it has not: a sentence with the one to take; DirectAdjoint gives x'' = 0 for a free flight."""
+    """Each adjoint in the mode that it has not: a sentence with the one to take; DirectAdjoint, which has both, gives the second derivative of (v t)^2."""
     net = js.Graph.from_edges(np.zeros((0, 2), int), 1)
 
     def end(speed):
@@ -413,7 +418,7 @@ def test_numbers_of_modes():
     net = js.Graph.from_edges(np.zeros((0, 2), int), 1)
     state, system = js.State.from_points(net, [[0.0, 0.0]]), js.System(net, 1.0)
     np.testing.assert_array_equal(js.normal_modes(system, state, np.int64(1)).frequencies, [0.0])
-    with pytest.raises(TypeError, match="n_modes = 1.5"):
+    with pytest.raises(TypeError, match=r"n_modes = 1\.5"):
         js.normal_modes(system, state, 1.5)
     with pytest.raises(ValueError, match="n_modes = 3, but the system has 2 free coordinates"):
         js.normal_modes(system, state, 3)

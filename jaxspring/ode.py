@@ -7,8 +7,9 @@ Held nodes have derivative zero and stay exactly where they are. Nodes on a sche
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, get_origin
 
 import equinox as eqx
@@ -124,9 +125,8 @@ def diffeqsolve(
         An `OdeResult`. Trouble is in its status, never an exception: NONFINITE, MAX_STEPS, SOLVER; call `raise_for_status(result)`.
 
     Raises:
-        ValueError: times that are not finite or of the wrong sign; options that do not fit together; a system with rules, which
-            need fixed steps.
-        TypeError: a solver that wants the right-hand side split: implicit-explicit or stochastic.
+        ValueError: times that are not finite or of the wrong sign; options that do not fit together; a system with rules.
+        TypeError: a solver that wants the right-hand side split (implicit-explicit, stochastic); a derivative that `adjoint` lacks.
 
     >>> net = js.lattice(2)
     >>> system = js.System(net, mass=1.0, forces=js.Springs(net, 1.0, 1.0))
@@ -136,30 +136,27 @@ def diffeqsolve(
     """
     import diffrax
 
-    solver = diffrax.Tsit5() if solver is None else solver
     _check_options(solver, saveat, stepsize_controller, adjoint, progress_meter, max_steps, event)
     _check_times(state, t1, dt0, may_be_infinite=event is not None)
-    # A fluid's list of neighbours changes no result; whatever else acts after a step would be left out.
-    rules = [type(part).__name__ for _, part in system.followers if not isinstance(part, Fluid)]
-    if rules:
-        raise ValueError(
-            f"{', '.join(rules)}: this acts after steps of fixed length, which an adaptive solver does not take. Use rollout, or leave it "
-            "out of the system (an event= can end a run at a contact)."
-        )
+    _check_parts(system)
     t1 = jnp.asarray(t1, state.dtype)
     dt0 = None if dt0 is None else jnp.asarray(dt0, state.dtype)
     if stepsize_controller is None:
         tolerance = float(jnp.finfo(state.dtype).eps) ** 0.5
-        is_constant = dt0 is not None
-        stepsize_controller = diffrax.ConstantStepSize() if is_constant else diffrax.PIDController(rtol=tolerance, atol=tolerance)
+        adaptive = diffrax.PIDController(rtol=tolerance, atol=tolerance)
+        stepsize_controller = adaptive if dt0 is None else diffrax.ConstantStepSize()
+    solver = diffrax.Tsit5() if solver is None else solver
     adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
     meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
-    if isinstance(adjoint, diffrax.BacksolveAdjoint) and saveat is not None:
-        raise ValueError("BacksolveAdjoint knows the last state only: leave out saveat, or use another adjoint.")
-    if isinstance(adjoint, diffrax.BacksolveAdjoint) and event is not None:
-        raise ValueError("BacksolveAdjoint cannot go back over an event. Leave the adjoint out, or use DirectAdjoint or ForwardMode.")
-    try:
+    with _mode_named(adjoint):
         return _solve(system, state, t1, solver, dt0, saveat, stepsize_controller, adjoint, meter, max_steps, event)
+
+
+@contextlib.contextmanager
+def _mode_named(adjoint: Any) -> Iterator[None]:
+    """Forward mode through an adjoint of reverse mode ends in a sentence that names the one to take."""
+    try:
+        yield
     except TypeError as error:
         if "forward-mode" not in str(error):
             raise
@@ -337,8 +334,18 @@ def _verdict(result: Any, n_steps: Array) -> Status:
     return Status.when(Flag.MAX_STEPS, too_long, step=n_steps).then(Status.when(Flag.SOLVER, gave_up, step=n_steps))
 
 
+def _check_parts(system: System) -> None:
+    """ValueError naming what acts after steps. A fluid's list of neighbours changes no result; anything else would be left out."""
+    rules = [type(part).__name__ for _, part in system.followers if not isinstance(part, Fluid)]
+    if rules:
+        raise ValueError(
+            f"{', '.join(rules)}: this acts after steps of fixed length, which an adaptive solver does not take. Use rollout, or leave it "
+            "out of the system (an event= can end a run at a contact)."
+        )
+
+
 def _check_options(solver: Any, saveat: Any, controller: Any, adjoint: Any, meter: Any, max_steps: Any, event: Any) -> None:
-    """TypeError where an option is of another kind, such as a class that was not called."""
+    """TypeError where an option is of another kind, such as a class that was not called; ValueError where two do not fit together."""
     import diffrax
 
     kinds = {
@@ -355,6 +362,10 @@ def _check_options(solver: Any, saveat: Any, controller: Any, adjoint: Any, mete
             raise TypeError(f"{name} is {what}; expected a diffrax object such as {example}, or None.")
     if max_steps is not None and (isinstance(max_steps, bool) or not isinstance(max_steps, (int, np.integer)) or max_steps < 1):
         raise ValueError(f"max_steps = {max_steps!r}; expected a whole number of 1 or more, or None for no limit.")
+    if isinstance(adjoint, diffrax.BacksolveAdjoint) and saveat is not None:
+        raise ValueError("BacksolveAdjoint knows the last state only: leave out saveat, or use another adjoint.")
+    if isinstance(adjoint, diffrax.BacksolveAdjoint) and event is not None:
+        raise ValueError("BacksolveAdjoint cannot go back over an event. Leave the adjoint out, or use DirectAdjoint or ForwardMode.")
 
 
 def _check_times(state: State, t1: Any, dt0: Any, *, may_be_infinite: bool) -> None:

@@ -151,8 +151,8 @@ def fit(
     >>> bool(jnp.all(jnp.abs(result.parameters - 3) < 1e-2))
     True
     """
-    _check_numbers(n_iterations, resume, checkpoint)
     _check_kinds(loss, parameters, on_iteration, stop, checkpoint)
+    _check_numbers(n_iterations, resume, checkpoint)
     clock = Stopwatch()
     optimiser = as_optimiser(optimiser)
     trained, rest = prepare(parameters)
@@ -163,11 +163,8 @@ def fit(
     carried = jax.tree.map(_as_array, carried)
     empty = {"loss": [], "gradient_norm": [], "seconds": []}
     start = Snapshot(free, free, first_memory(objective, optimiser, free, carried), carried, carried, 0, -1, empty)
-    settings = {name: value for name, value in fingerprint(optimiser).items() if name not in optimiser.may_change}
-    identity = {"coordinates": "; ".join(map(str, chosen)), "optimiser": settings}
-    known_loss = None
-    if resume and checkpoint is not None:
-        start, known_loss = read_checkpoint(checkpoint, start, identity)
+    identity = {"coordinates": "; ".join(map(str, chosen)), "optimiser": _settings(optimiser)}
+    start, known_loss = read_checkpoint(checkpoint, start, identity) if resume and checkpoint is not None else (start, None)
     run = _Run(objective, optimiser, start, identity, checkpoint, known_loss)
     reason = run.to_end(n_iterations, stop or Stop(), on_iteration, progress, clock)
     return run.result(reason, trained)
@@ -302,6 +299,11 @@ class _Run:
         """Write where the last evaluation started, and what it gave: it is done again on resuming, to see that the loss is the same."""
         if self.checkpoint is not None and self.done is not None:
             write_checkpoint(self.checkpoint, self.done, self.identity)
+
+
+def _settings(optimiser: Any) -> dict[str, str]:
+    """Those of an optimiser that a resumed fit must share."""
+    return {name: value for name, value in fingerprint(optimiser).items() if name not in optimiser.may_change}
 
 
 def _as_array(leaf: Any) -> Any:

@@ -351,7 +351,7 @@ def test_wrong_conditions_are_named(condition, kind, words):
     ids=["default jacfwd", "backsolve jacfwd", "forward grad", "direct hessian"],
 )
 def test_the_mode_that_an_adjoint_lacks_is_named(adjoint, mode, words):
-    """Each adjoint in the mode that it has not: a sentence with the one to take; DirectAdjoint, which has both, gives the second derivative of (v t)^2."""
+    """Each adjoint in the mode that it has not: a sentence with the one to take; DirectAdjoint has both."""
     net = js.Graph.from_edges(np.zeros((0, 2), int), 1)
 
     def end(speed):

@@ -113,4 +113,5 @@ def _checked(function: Any, value: Any) -> Any:
             f"the event's condition {name} returned {jnp.shape(value)} of {dtype}; expected one boolean or one real number, such as "
             "state.position.y[0] (the height of node 0) or jnp.min(state.position.y)."
         )
-    return jnp.asarray(value, dtype)
+    # diffrax joins the number with a Python zero, which has JAX's own width: a float32 run where x64 is on would not match.
+    return jnp.asarray(value, dtype) if dtype == jnp.bool_ else jnp.asarray(value, dtype).astype(float)

@@ -130,8 +130,7 @@ def diffeqsolve(
 
     >>> net = js.lattice(2)
     >>> system = js.System(net, mass=1.0, forces=js.Springs(net, 1.0, 1.0))
-    >>> result = diffeqsolve(system, js.State.from_points(net, net.grid()), t1=1.0)
-    >>> print(result.state.time)
+    >>> print(diffeqsolve(system, js.State.from_points(net, net.grid()), t1=1.0).state.time)
     1.0
     """
     import diffrax

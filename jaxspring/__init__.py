@@ -94,6 +94,7 @@ _HOMES = {
     "thermal.split": ("SplitHeat", "SymmetricSplitHeat"),
     "thermal.stiffness": ("ThermalExpansion", "ThermalStiffness"),
     "inverse.fit": ("Fit", "History", "Iteration", "fit"),
+    "inverse.determined": ("Undetermined",),
     "inverse.iteration": ("GradientWarning",),
     "inverse.optimisers": ("LBFGS", "Adam", "LeastSquares", "Optax", "Optimiser"),
     "inverse.stopping": ("Stop", "StopReason"),

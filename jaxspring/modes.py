@@ -83,6 +83,10 @@ def normal_modes(system: System, state: State, n_modes: int | None = None) -> Mo
     n_free = _count_free(system, state)
     if not n_free:
         raise ValueError("Every coordinate is held, so that nothing moves and there are no modes. Free one, see `free` of System.")
+    if n_modes is not None:
+        if isinstance(n_modes, bool) or not isinstance(n_modes, (int, np.integer)):
+            raise TypeError(f"n_modes = {n_modes!r}; expected a whole number, or None for all.")
+        n_modes = int(n_modes)
     if n_modes is not None and not 0 < n_modes <= n_free:
         raise ValueError(f"n_modes = {n_modes}, but the system has {n_free} free coordinates; expected 1 to {n_free}.")
     if n > LARGEST_DENSE:
@@ -199,7 +203,7 @@ def _responses(system: System, state: State, frequencies: Array, force: tuple[Ar
         real = jnp.where(both, stiffness - jnp.diag(w * w * mass), unit)
         return jnp.linalg.solve(lax.complex(real, jnp.where(both, w * damping, jnp.zeros_like(damping))), load)
 
-    return lax.map(solve, frequencies).reshape(len(frequencies), -1, state.dim)
+    return lax.map(solve, frequencies).reshape(len(frequencies), len(free) // state.dim, state.dim)
 
 
 def _linearised(system: System, state: State, *, with_damping: bool) -> tuple[Array, Array]:

@@ -7,17 +7,22 @@ Held nodes have derivative zero and stay exactly where they are. Nodes on a sche
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, get_origin
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from ._arrays import given
 from ._checks import as_inexact, finite, has_shape, is_concrete
+from .events import on_states
+from .forces.fluid import Fluid
+from .numerics import linear_call
 from .state import State
 from .status import Flag, Status
 from .system import System
@@ -57,6 +62,8 @@ class OdeResult(eqx.Module):
         times: [s], in the structure of `saveat`; infinite in slots that were not reached.
         status: what went wrong, if anything; see `raise_for_status`.
         info: facts about the run.
+        event: booleans in the structure of the event's conditions: which one ended the run, at `state.time`. All are False where the
+            run came to t1 or failed; None without an event.
         effects: names of the system's forces, for messages (static).
     """
 
@@ -65,12 +72,19 @@ class OdeResult(eqx.Module):
     times: Any
     status: Status
     info: OdeInfo
+    event: Any
     effects: tuple[str, ...] = eqx.field(static=True)
 
     def at(self, time: Any) -> State:
         """The state at any time [s] between the start and the end; needs `saveat=diffrax.SaveAt(dense=True)`."""
         if self.info.interpolation is None:
             raise ValueError("this result keeps no interpolation. Pass saveat=diffrax.SaveAt(dense=True) to diffeqsolve.")
+        times = (self.info.interpolation.t0, self.info.interpolation.t1)
+        if all(is_concrete(value) for value in (time, *times)):
+            low, high = sorted(float(value) for value in times)
+            slack = float(jnp.finfo(self.state.dtype).eps) * max(abs(low), abs(high))
+            if not np.all((np.asarray(time) >= low - slack) & (np.asarray(time) <= high + slack)):
+                raise ValueError(f"time = {time} lies outside this run, which went from {float(times[0])} to {float(times[1])}.")
         time = as_inexact("time", time, self.state.dtype)
         position, velocity = self.info.interpolation.evaluate(time)
         return self.state.moved(position, velocity, time)
@@ -87,6 +101,7 @@ def diffeqsolve(
     adjoint: diffrax.AbstractAdjoint | None = None,
     progress_meter: diffrax.AbstractProgressMeter | None = None,
     max_steps: int | None = 4096,
+    event: diffrax.Event | None = None,
 ) -> OdeResult:
     """Solve a system from `state.time` to `t1` by a diffrax solver: explicit, implicit or semi-implicit.
 
@@ -102,39 +117,53 @@ def diffeqsolve(
         adjoint: how derivatives are taken; `diffrax.RecursiveCheckpointAdjoint()` (reverse mode) unless said.
         progress_meter: e.g. `diffrax.TqdmProgressMeter()`.
         max_steps: most steps to try.
+        event: a `diffrax.Event`, which ends the run early. Its conditions are called as cond_fn(time, state, system). A boolean ends the
+            run at the end of the step; a number that changes its sign ends it at the zero, to the tolerance of the event's `root_finder`
+            (without one at the end of the step, whose time has no derivative by the parameters). With a root finder the final state and
+            its time are differentiable. A number that is zero at the start counts as crossed when it comes back. t1 may be infinite.
 
     Returns:
         An `OdeResult`. Trouble is in its status, never an exception: NONFINITE, MAX_STEPS, SOLVER; call `raise_for_status(result)`.
 
     Raises:
-        ValueError: times that are not finite or of the wrong sign; options that do not fit together; a system with rules, which
-            need fixed steps.
-        TypeError: a solver that wants the right-hand side split: implicit-explicit or stochastic.
+        ValueError: times that are not finite or of the wrong sign; options that do not fit together; a system with rules.
+        TypeError: a solver that wants the right-hand side split (implicit-explicit, stochastic); a derivative that `adjoint` lacks.
 
     >>> net = js.lattice(2)
     >>> system = js.System(net, mass=1.0, forces=js.Springs(net, 1.0, 1.0))
-    >>> result = diffeqsolve(system, js.State.from_points(net, net.grid()), t1=1.0)
-    >>> print(result.state.time)
+    >>> print(diffeqsolve(system, js.State.from_points(net, net.grid()), t1=1.0).state.time)
     1.0
     """
     import diffrax
 
-    solver = diffrax.Tsit5() if solver is None else solver
-    _check_times(state.checked(), t1, dt0)
-    if system.rules:
-        names = ", ".join(type(rule).__name__ for rule in system.rules)
-        raise ValueError(f"{names} acts after steps of fixed length, which an adaptive solver does not take. Use rollout.")
+    _check_options(solver, saveat, stepsize_controller, adjoint, progress_meter, max_steps, event)
+    _check_times(state.checked(), t1, dt0, may_be_infinite=event is not None)
+    _check_parts(system)
     t1 = as_inexact("t1", t1, state.dtype)
     dt0 = None if dt0 is None else as_inexact("dt0", dt0, state.dtype)
     if stepsize_controller is None:
         tolerance = float(jnp.finfo(state.dtype).eps) ** 0.5
-        is_constant = dt0 is not None
-        stepsize_controller = diffrax.ConstantStepSize() if is_constant else diffrax.PIDController(rtol=tolerance, atol=tolerance)
+        adaptive = diffrax.PIDController(rtol=tolerance, atol=tolerance)
+        stepsize_controller = adaptive if dt0 is None else diffrax.ConstantStepSize()
+    solver = diffrax.Tsit5() if solver is None else solver
     adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
     meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
-    if isinstance(adjoint, diffrax.BacksolveAdjoint) and saveat is not None:
-        raise ValueError("BacksolveAdjoint knows the last state only: leave out saveat, or use another adjoint.")
-    return _solve(system, state, t1, solver, dt0, saveat, stepsize_controller, adjoint, meter, max_steps)
+    with _mode_named(adjoint):
+        return _solve(system, state, t1, solver, dt0, saveat, stepsize_controller, adjoint, meter, max_steps, event)
+
+
+@contextlib.contextmanager
+def _mode_named(adjoint: Any) -> Iterator[None]:
+    """Forward mode through an adjoint of reverse mode ends in a sentence that names the one to take."""
+    try:
+        yield
+    except TypeError as error:
+        if "forward-mode" not in str(error):
+            raise
+        raise TypeError(
+            f"{type(adjoint).__name__} takes derivatives in reverse mode only, and this is forward mode (jvp, jacfwd, linearize, hessian). "
+            "Pass adjoint=diffrax.ForwardMode() for jvp and jacfwd, or diffrax.DirectAdjoint(), which takes both modes, for hessian."
+        ) from error
 
 
 @eqx.filter_jit
@@ -149,6 +178,7 @@ def _solve(
     adjoint: Any,
     meter: Any,
     max_steps: int | None,
+    event: Any,
 ) -> OdeResult:
     import diffrax
 
@@ -157,22 +187,27 @@ def _solve(
     start = ready.constrain(dataclasses.replace(state, neighbours=None))
     before = begin(system, ready, Carry(start, None, jnp.zeros((), jnp.int32)), jnp.zeros((), state.dtype), None)
     end = diffrax.SubSaveAt(t1=True)
+    scene = _Scene(ready, dataclasses.replace(start, position=None, velocity=None))
+    y0 = (start.position, start.velocity)
     solution = diffrax.diffeqsolve(
         _terms(ready, start, solver),
         solver,
         start.time,
         t1,
         dt0,
-        (start.position, start.velocity),
-        args=_Scene(ready, dataclasses.replace(start, position=None, velocity=None)),
+        y0,
+        args=scene,
         saveat=diffrax.SaveAt(subs=end) if saveat is None else _with_end(saveat, end),
         stepsize_controller=controller,
         adjoint=adjoint,
         max_steps=max_steps,
         throw=False,
         progress_meter=meter,
+        event=None if event is None else on_states(event, _as_state, _flow, (start.time, y0, scene), t1),
     )
     found: Any = solution
+    if isinstance(adjoint, diffrax.ForwardMode):
+        found = eqx.tree_at(lambda s: (s.ts, s.ys), solution, _forward_only((solution.ts, solution.ys)))
     times, frames = (found.ts, found.ys) if saveat is None else (found.ts[1], found.ys[1])
     last = _as_state(times[0], jax.tree.map(lambda a: a[0], frames), _Scene(ready, start))
     names = ("num_steps", "num_accepted_steps", "num_rejected_steps")
@@ -184,7 +219,31 @@ def _solve(
         times=None if saveat is None else found.ts[0],
         status=jax.lax.stop_gradient(status),
         info=OdeInfo(n_steps, n_accepted, n_rejected, solution.result, solution.interpolation),
+        event=solution.event_mask,
         effects=system.effects,
+    )
+
+
+def _forward_only(tree: Any) -> Any:
+    """The tree, whose derivative in reverse mode is an error that says so."""
+    arrays, rest = eqx.partition(tree, eqx.is_inexact_array)
+    return eqx.combine(_marked(arrays), rest)
+
+
+@jax.custom_jvp
+def _marked(arrays: Any) -> Any:
+    return arrays
+
+
+@_marked.defjvp
+def _marked_jvp(primals: Any, tangents: Any) -> Any:
+    return primals[0], linear_call(lambda _, tangent: tangent, _refuse_reverse, None, tangents[0])
+
+
+def _refuse_reverse(_: Any, cotangent: Any) -> Any:
+    raise TypeError(
+        "ForwardMode takes derivatives in forward mode only (jvp, jacfwd), and this is reverse mode (grad, jacrev). Leave the adjoint out, "
+        "or pass diffrax.DirectAdjoint(), which takes both modes."
     )
 
 
@@ -271,14 +330,51 @@ def _verdict(result: Any, n_steps: Array) -> Status:
 
     codes = diffrax.RESULTS
     too_long = (result == codes.max_steps_reached) | (result == codes.max_steps_rejected)
-    gave_up = (result != codes.successful) & ~too_long
+    gave_up = (result != codes.successful) & (result != codes.event_occurred) & ~too_long
     return Status.when(Flag.MAX_STEPS, too_long, step=n_steps).then(Status.when(Flag.SOLVER, gave_up, step=n_steps))
 
 
-def _check_times(state: State, t1: Any, dt0: Any) -> None:
+def _check_parts(system: System) -> None:
+    """ValueError naming what acts after steps. A fluid's list of neighbours changes no result; anything else would be left out."""
+    rules = [type(part).__name__ for _, part in system.followers if not isinstance(part, Fluid)]
+    if rules:
+        raise ValueError(
+            f"{', '.join(rules)}: this acts after steps of fixed length, which an adaptive solver does not take. Use rollout, or leave it "
+            "out of the system (an event= can end a run at a contact)."
+        )
+
+
+def _check_options(solver: Any, saveat: Any, controller: Any, adjoint: Any, meter: Any, max_steps: Any, event: Any) -> None:
+    """TypeError where an option is of another kind, such as a class that was not called; ValueError where two do not fit together."""
+    import diffrax
+
+    kinds = {
+        "solver": (solver, diffrax.AbstractSolver, "diffrax.Tsit5()"),
+        "saveat": (saveat, diffrax.SaveAt, "diffrax.SaveAt(ts=...)"),
+        "stepsize_controller": (controller, diffrax.AbstractStepSizeController, "diffrax.PIDController(rtol=1e-6, atol=1e-6)"),
+        "adjoint": (adjoint, diffrax.AbstractAdjoint, "diffrax.DirectAdjoint()"),
+        "progress_meter": (meter, diffrax.AbstractProgressMeter, "diffrax.TqdmProgressMeter()"),
+        "event": (event, diffrax.Event, "diffrax.Event(lambda time, state, system: state.position.y[0], optimistix.Newton(1e-8, 1e-8))"),
+    }
+    for name, (value, kind, example) in kinds.items():
+        if value is not None and not isinstance(value, kind):
+            what = f"the class {value.__name__}, not called" if isinstance(value, type) else f"a {type(value).__name__}"
+            raise TypeError(f"{name} is {what}; expected a diffrax object such as {example}, or None.")
+    if max_steps is not None and (isinstance(max_steps, bool) or not isinstance(max_steps, (int, np.integer)) or max_steps < 1):
+        raise ValueError(f"max_steps = {max_steps!r}; expected a whole number of 1 or more, or None for no limit.")
+    if isinstance(adjoint, diffrax.BacksolveAdjoint) and saveat is not None:
+        raise ValueError("BacksolveAdjoint knows the last state only: leave out saveat, or use another adjoint.")
+    if isinstance(adjoint, diffrax.BacksolveAdjoint) and event is not None:
+        raise ValueError("BacksolveAdjoint cannot go back over an event. Leave the adjoint out, or use DirectAdjoint or ForwardMode.")
+
+
+def _check_times(state: State, t1: Any, dt0: Any, *, may_be_infinite: bool) -> None:
     for name, value in (("t1", t1), ("dt0", dt0)):
-        if value is not None:
-            has_shape(name, given(name, value), {"one number": ()})
+        if value is None:
+            continue
+        has_shape(name, given(name, value), {"one number": ()})
+        is_endless = name == "t1" and may_be_infinite and is_concrete(value) and np.all(np.isinf(value))
+        if is_concrete(value) and not is_endless:
             finite(name, value)
     if dt0 is None or not all(is_concrete(value) for value in (state.time, t1, dt0)):
         return

@@ -40,9 +40,10 @@ class Flag(enum.IntFlag):
     PRECISION = 32768
     SOLVER = 65536
     UNSTABLE = 131072
+    UNDETERMINED = 262144
 
 
-WARNINGS = Flag.COINCIDENT | Flag.OVERLAP | Flag.OUTSIDE | Flag.DT_LIMIT | Flag.PRECISION
+WARNINGS = Flag.COINCIDENT | Flag.OVERLAP | Flag.OUTSIDE | Flag.DT_LIMIT | Flag.PRECISION | Flag.UNDETERMINED
 
 EXPLANATION = {
     Flag.NONFINITE: "a position, velocity or temperature is NaN or infinite, or a spring so long that its square is; try a smaller dt "
@@ -63,6 +64,7 @@ EXPLANATION = {
     Flag.PRECISION: "rounding of such large coordinates spoils the springs' forces; move the scene to the origin, or use float64",
     Flag.SOLVER: "the solver gave up: its solve did not reach the accuracy it needs, or its step shrank to the least allowed",
     Flag.UNSTABLE: "the forces balance, but the shape is no minimum of the energy: a small push makes it buckle; start from one",
+    Flag.UNDETERMINED: "the data leave some of the parameters open; fix or tie them, or add data",
     Flag.INVALID: "a parameter has a value that its constructor would refuse (sign, NaN or infinity)",
 }
 
@@ -171,6 +173,6 @@ def raise_for_status(result: Any) -> None:
         hint = getattr(getattr(result, "info", None), "stable_dt", None)
         least = np.inf if hint is None else float(np.min(np.asarray(hint)))
         limit = f" The stability limit of this run was dt = {least:.6g}." if np.isfinite(least) else ""
-        raise SimulationError(status.describe(note) + "." + limit)
+        raise SimulationError((getattr(result, "explanation", "") or status.describe(note)) + "." + limit)
     if bool(np.any(np.asarray(status.flags) != 0)):
-        warnings.warn(status.describe(note), StabilityWarning, stacklevel=2)
+        warnings.warn(getattr(result, "explanation", "") or status.describe(note), StabilityWarning, stacklevel=2)

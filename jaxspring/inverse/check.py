@@ -22,6 +22,7 @@ from ..files import leaf_name
 from ..numerics import cast_inexact
 from ..status import Flag, Status
 from .iteration import prepare
+from .optimisers import one_number
 
 PyTree = Any
 N_STEPS = 14
@@ -64,6 +65,14 @@ class GradientCheck:
     status: Status
 
     @property
+    def explanation(self) -> str:
+        """The status in words."""
+        if bool(self.status.is_ok):
+            return "OK"
+        bad = ", ".join(leaf.name for leaf in self.leaves if not np.isfinite(leaf.gradient))
+        return f"NONFINITE: the loss is {self.value}" if not np.isfinite(self.value) else f"NONFINITE: the gradient by {bad} is not finite"
+
+    @property
     def error(self) -> float:
         """The largest error of any leaf; NaN where something is not finite."""
         return float(np.max([leaf.error for leaf in self.leaves]))
@@ -92,6 +101,8 @@ def check_gradient(loss: Callable[[PyTree], Any], parameters: PyTree, seed: int 
     >>> print(check_gradient(lambda p: jnp.sum(p**3), jnp.ones(4)).error < 1e-9)
     True
     """
+    if not callable(loss):
+        raise TypeError(f"loss is a {type(loss).__name__}; expected a function of the parameters: check_gradient(loss, parameters).")
     rng = np.random.default_rng(seed)
     with jax.enable_x64(True), np.errstate(all="ignore"):
         wide = jax.tree.map(_widened, parameters, is_leaf=lambda x: isinstance(x, np.ndarray))
@@ -99,7 +110,7 @@ def check_gradient(loss: Callable[[PyTree], Any], parameters: PyTree, seed: int 
 
         @jax.jit
         def value_of(p: PyTree) -> Any:
-            return loss(eqx.combine(p, rest))
+            return one_number(loss(eqx.combine(p, rest)))
 
         value, gradient = jax.jit(jax.value_and_grad(value_of))(trained)
         named = jax.tree_util.tree_leaves_with_path(trained)
@@ -110,7 +121,7 @@ def check_gradient(loss: Callable[[PyTree], Any], parameters: PyTree, seed: int 
             along = _Line(value_of, trained, i, direction, float(value))
             checks.append(_check_leaf(leaf_name(path), along, leaf, np.asarray(slope)))
         finite = bool(np.isfinite(value)) and all(bool(jnp.all(jnp.isfinite(g))) for g in jax.tree.leaves(gradient))
-    return GradientCheck(tuple(checks), float(value), Status.when(Flag.NONFINITE, not finite, step=0))
+    return GradientCheck(tuple(checks), float(value), Status.when(Flag.NONFINITE, not finite))
 
 
 @dataclass(frozen=True)

@@ -57,17 +57,24 @@ class Snapshot(eqx.Module):
     history: dict[str, list[float]]
 
 
-def write_checkpoint(place: Checkpoint, snapshot: Snapshot, coordinates: str) -> None:
-    """Write a snapshot atomically. `coordinates` tells the transforms: the numbers mean nothing without them."""
+def write_checkpoint(place: Checkpoint, snapshot: Snapshot, identity: dict[str, Any]) -> None:
+    """Write a snapshot atomically, with the loss at its parameters, which the history holds already.
+
+    Args:
+        place: where.
+        snapshot: what the iteration after it starts from.
+        identity: what the numbers mean nothing without: the transforms ("coordinates") and the settings of the optimiser.
+    """
     arrays = {f"history/{name}": np.asarray(snapshot.history[name][: snapshot.iteration], np.float64) for name in HISTORY}
     for part in PARTS:
         arrays |= {f"{part}/{name}": array for name, array in named_arrays(getattr(snapshot, part)).items()}
-    about = {"kind": "fit", "note": place.note, "coordinates": coordinates, "best_iteration": snapshot.best_iteration}
+    arrays["next/loss"] = np.asarray(snapshot.history["loss"][snapshot.iteration], np.float64)
+    about = {"kind": "fit", "note": place.note, "best_iteration": snapshot.best_iteration} | identity
     write_archive(place.path, arrays, about | {"topologies": topologies(snapshot.parameters)})
 
 
-def read_checkpoint(place: Checkpoint, like: Snapshot, coordinates: str) -> Snapshot:
-    """The snapshot in a file, in the shape of `like`.
+def read_checkpoint(place: Checkpoint, like: Snapshot, identity: dict[str, Any]) -> tuple[Snapshot, float]:
+    """The snapshot in a file, in the shape of `like`, and the loss at its parameters.
 
     Raises:
         CheckpointError: the file is damaged, or belongs to another fit: another note, other parameters, transforms, optimiser or topology.
@@ -78,9 +85,10 @@ def read_checkpoint(place: Checkpoint, like: Snapshot, coordinates: str) -> Snap
     archive = read_archive(path)
     expect_same(path, "kind", archive.about.get("kind"), "fit")
     expect_same(path, "problem", archive.about.get("note"), place.note)
-    expect_same(path, "transforms", archive.about.get("coordinates"), coordinates)
+    expect_same(path, "transforms", archive.about.get("coordinates"), identity["coordinates"])
+    _expect_same_settings(path, archive.about.get("optimiser") or {}, identity["optimiser"])
     expect_same(path, "topology", archive.about.get("topologies"), topologies(like.parameters))
-    groups: dict[str, dict[str, np.ndarray]] = {part: {} for part in (*PARTS, "history")}
+    groups: dict[str, dict[str, np.ndarray]] = {part: {} for part in (*PARTS, "history", "next")}
     for name, array in archive.arrays.items():
         part, _, rest = name.partition("/")
         if part not in groups:
@@ -91,4 +99,25 @@ def read_checkpoint(place: Checkpoint, like: Snapshot, coordinates: str) -> Snap
     history = {name: groups["history"][name].tolist() for name in HISTORY}
     best_iteration = archive.about["best_iteration"]
     values = [parts[part] for part in PARTS]
-    return Snapshot(*values, iteration=len(history["loss"]), best_iteration=best_iteration, history=history)
+    snapshot = Snapshot(*values, iteration=len(history["loss"]), best_iteration=best_iteration, history=history)
+    return snapshot, float(groups["next"]["loss"])
+
+
+def expect_same_loss(place: Checkpoint, found: float, expected: float, dtype: Any) -> None:
+    """CheckpointError where the loss at the stored parameters is another than when they were stored.
+
+    The same program on the same machine gives the same bits; other machines and versions may differ by rounding.
+    """
+    slack = float(np.sqrt(np.finfo(dtype).eps)) * abs(expected)
+    if not abs(found - expected) <= slack:
+        complain(
+            place.path,
+            f"the loss at its parameters is {found!r}; expected {expected!r}, as when they were stored. The loss, its data or what it "
+            "carries has changed: start anew without resume=True, from fit.parameters of the old run if they are a good start",
+        )
+
+
+def _expect_same_settings(path: Path, found: dict[str, str], expected: dict[str, str]) -> None:
+    """CheckpointError naming the first setting of the optimiser that differs."""
+    for name in sorted({*found, *expected}, key=lambda name: (name != "type", name)):
+        expect_same(path, f"optimiser's {name}", found.get(name), expected.get(name))

@@ -15,13 +15,17 @@ import jax
 import numpy as np
 
 from .._arrays import own
+from ..numerics import is_traced
 from ..progress import Progress, Stopwatch
 from ..status import Flag, Status
-from .checkpoint import Checkpoint, Snapshot, read_checkpoint, write_checkpoint
+from .checkpoint import Checkpoint, Snapshot, expect_same_loss, read_checkpoint, write_checkpoint
+from .determined import Undetermined, from_jacobian, from_zeros, slopes
+from .explain import Seen, explanation
+from .fingerprint import fingerprint
 from .iteration import Objective, Report, first_memory, iterate, prepare, refuse_invalid, warn_of_zero_gradients
 from .optimisers import as_optimiser
 from .stopping import Stop, StopReason
-from .transforms import to_free, transform_per_leaf
+from .transforms import to_constrained, to_free, transform_per_leaf
 
 PyTree = Any
 
@@ -54,8 +58,10 @@ class Fit:
         carried: what the loss handed on last (None without).
         info: what else the loss returned last (None without).
         best_carried: what the loss handed on at its lowest (None without).
-        status: NONFINITE, INVALID or INTERRUPTED, with the iteration as its step; see `raise_for_status`.
+        status: NONFINITE, INVALID, INTERRUPTED or the warning UNDETERMINED, with the iteration as its step; see `raise_for_status`.
         reason: why it ended.
+        undetermined: what the data leave open, see `Undetermined`; None where nothing is known to be.
+        explanation: the status in words.
     """
 
     parameters: PyTree
@@ -68,6 +74,8 @@ class Fit:
     best_carried: PyTree
     status: Status
     reason: StopReason
+    undetermined: Undetermined | None
+    explanation: str
 
 
 @dataclass(frozen=True)
@@ -144,6 +152,7 @@ def fit(
     >>> bool(jnp.all(jnp.abs(result.parameters - 3) < 1e-2))
     True
     """
+    _check_kinds(loss, parameters, on_iteration, stop, checkpoint)
     _check_numbers(n_iterations, resume, checkpoint)
     clock = Stopwatch()
     optimiser = as_optimiser(optimiser)
@@ -155,20 +164,30 @@ def fit(
     carried = jax.tree.map(_as_array, carried)
     empty = {"loss": [], "gradient_norm": [], "seconds": []}
     start = Snapshot(free, free, first_memory(objective, optimiser, free, carried), carried, carried, 0, -1, empty)
-    coordinates = "; ".join(map(str, chosen))
-    if resume and checkpoint is not None:
-        start = read_checkpoint(checkpoint, start, coordinates)
-    run = _Run(objective, optimiser, start, coordinates, checkpoint)
+    identity = {"coordinates": "; ".join(map(str, chosen)), "optimiser": _settings(optimiser)}
+    start, known_loss = read_checkpoint(checkpoint, start, identity) if resume and checkpoint is not None else (start, None)
+    run = _Run(objective, optimiser, start, identity, checkpoint, known_loss)
     reason = run.to_end(n_iterations, stop or Stop(), on_iteration, progress, clock)
-    return run.result(reason)
+    return run.result(reason, trained)
 
 
 class _Run:
     """The host's side of a fit: what changes from iteration to iteration."""
 
-    def __init__(self, objective: Objective, optimiser: Any, start: Snapshot, coordinates: str, checkpoint: Checkpoint | None):
-        self.objective, self.optimiser, self.coordinates, self.checkpoint = objective, optimiser, coordinates, checkpoint
-        self.now = start  # what a resumed fit would start from
+    def __init__(
+        self,
+        objective: Objective,
+        optimiser: Any,
+        start: Snapshot,
+        identity: dict[str, Any],
+        checkpoint: Checkpoint | None,
+        known_loss: float | None,
+    ):
+        self.objective, self.optimiser, self.identity, self.checkpoint = objective, optimiser, identity, checkpoint
+        self.known_loss = known_loss  # what the first evaluation must give where this goes on from a checkpoint
+        self.now = start  # where the next evaluation starts
+        self.done: Snapshot | None = None  # where the last evaluation started, which a resumed fit would do again
+        self.report, self.zeros = None, None
         self.history = start.history
         self.best, self.best_iteration, self.last = start.best, start.best_iteration, start.parameters
         self.status, self.info, self.carried, self.best_carried = Status.ok(), None, start.carried, start.best_carried
@@ -183,9 +202,9 @@ class _Run:
                 if progress is not None:
                     progress.update(min(len(self.history["loss"]) - 1, n_iterations), n_iterations)
                 if reason is None:
-                    self.now = self._next(report)
-                    if self.checkpoint is not None and self.now.iteration % self.checkpoint.every == 0:
+                    if self.checkpoint is not None and self.now.iteration and self.now.iteration % self.checkpoint.every == 0:
                         self._save()
+                    self.now = self._next(report)
         except KeyboardInterrupt:
             if not self.history["loss"]:
                 raise
@@ -195,24 +214,50 @@ class _Run:
             self._save()
         return reason
 
-    def result(self, reason: StopReason) -> Fit:
+    def result(self, reason: StopReason, started: PyTree) -> Fit:
         """The outcome, in the user's coordinates."""
+        undetermined = self._undetermined(reason, started)
+        self.status = self.status.then(Status.when(Flag.UNDETERMINED, undetermined is not None, step=self.best_iteration))
         value = self.history["loss"][self.best_iteration] if self.best_iteration >= 0 else float("nan")
         back = self.objective.parameters
         history = History(*(np.asarray(self.history[name]) for name in ("loss", "gradient_norm", "seconds")))
         last, best = (self.carried, self.info), self.best_carried
         if not self.objective.has_carried:
             last, best = (None, None), None
-        return Fit(back(self.best), back(self.last), value, self.best_iteration, history, *last, best, self.status, reason)
+        words = "OK" if int(self.status.flags) == 0 else explanation(self.status, self._seen(), undetermined)
+        values = (back(self.best), back(self.last), value, self.best_iteration, history, *last, best)
+        return Fit(*values, self.status, reason, undetermined, words)
+
+    def _undetermined(self, reason: StopReason, started: PyTree) -> Undetermined | None:
+        """What the data leave open: by the Jacobian of least squares, else by gradients that were always zero."""
+        if self.report is None or reason is StopReason.FAILED:
+            return None
+        linear = self.optimiser.linearised(self.objective, self.best, self.report.memory, self.now.carried)
+        if linear is None:
+            return from_zeros(self.zeros) if len(self.history["loss"]) > 1 else None
+        residuals, jacobian = map(np.asarray, linear)
+        transforms = self.objective.transforms
+        return from_jacobian(jacobian, residuals, started, to_constrained(transforms, self.best), slopes(transforms, self.best))
+
+    def _seen(self) -> Seen:
+        index = len(self.history["loss"]) - 1
+        bad = () if self.report is None else self.report.checks.bad_gradients
+        return Seen(self.objective, self.last, self.now.carried, index, self.history["loss"][index], bad)
 
     def _advance(self) -> Report:
         watch = Stopwatch()
         report = iterate(self.objective, self.optimiser, self.now.parameters, self.now.memory, self.now.carried)
+        _refuse_traced("what the loss reads", report.checks)
         report = eqx.tree_at(lambda r: r.checks, report, jax.device_get(report.checks))
         index = self.now.iteration
         checks = report.checks
+        if self.checkpoint is not None and self.known_loss is not None:
+            expect_same_loss(self.checkpoint, float(checks.value), self.known_loss, checks.value.dtype)
+            self.known_loss = None
         if index == 0:
-            warn_of_zero_gradients(self.now.parameters, checks.is_zero)
+            warn_of_zero_gradients(checks.zeros)
+        self.report, self.done = report, self.now
+        self.zeros = checks.zeros if self.zeros is None else jax.tree.map(np.logical_and, self.zeros, checks.zeros)
         self.history["loss"].append(float(checks.value))
         self.history["gradient_norm"].append(float(checks.gradient_norm))
         self.history["seconds"].append(watch.seconds)
@@ -233,9 +278,10 @@ class _Run:
         asked = None
         if on_iteration is not None:
             norm = float(checks.gradient_norm)
-            asked = on_iteration(
-                Iteration(index, loss, norm, clock.seconds, is_best, report.info, report.carried, self.objective, report.at)
-            )
+            told = Iteration(index, loss, norm, clock.seconds, is_best, report.info, report.carried, self.objective, report.at)
+            asked = on_iteration(told)
+            if asked is not None and np.ndim(asked):
+                raise TypeError(f"on_iteration returned {type(asked).__name__} of shape {np.shape(asked)}; expected True to end, or None.")
         if not usable:
             return StopReason.FAILED
         if asked:
@@ -251,9 +297,14 @@ class _Run:
         return Snapshot(report.after, self.best, report.memory, report.carried, self.best_carried, done, self.best_iteration, self.history)
 
     def _save(self) -> None:
-        """Write what the next iteration starts from; an evaluation that was not followed by an update is done again on resuming."""
-        if self.checkpoint is not None:
-            write_checkpoint(self.checkpoint, self.now, self.coordinates)
+        """Write where the last evaluation started, and what it gave: it is done again on resuming, to see that the loss is the same."""
+        if self.checkpoint is not None and self.done is not None:
+            write_checkpoint(self.checkpoint, self.done, self.identity)
+
+
+def _settings(optimiser: Any) -> dict[str, str]:
+    """Those of an optimiser that a resumed fit must share."""
+    return {name: value for name, value in fingerprint(optimiser).items() if name not in optimiser.may_change}
 
 
 def _as_array(leaf: Any) -> Any:
@@ -270,3 +321,24 @@ def _check_numbers(n_iterations: int, resume: bool, checkpoint: Checkpoint | Non
         raise ValueError(f"n_iterations = {n_iterations}; expected zero or more.")
     if resume and checkpoint is None:
         raise ValueError("resume=True needs to know from where: pass checkpoint=Checkpoint(path).")
+
+
+def _check_kinds(loss: Any, parameters: PyTree, on_iteration: Any, stop: Any, checkpoint: Any) -> None:
+    if not callable(loss):
+        raise TypeError(f"loss is a {type(loss).__name__}; expected a function of the parameters: fit(loss, parameters).")
+    if on_iteration is not None and not callable(on_iteration):
+        raise TypeError(f"on_iteration is a {type(on_iteration).__name__}; expected a function of an `Iteration`.")
+    if stop is not None and not isinstance(stop, Stop):
+        raise TypeError(f"stop is a {type(stop).__name__}; expected Stop(target=..., gradient_norm=..., ...).")
+    if checkpoint is not None and not isinstance(checkpoint, Checkpoint):
+        raise TypeError(f"checkpoint is a {type(checkpoint).__name__}; expected Checkpoint(path, every=25).")
+    _refuse_traced("parameters", parameters)
+
+
+def _refuse_traced(what: str, tree: PyTree) -> None:
+    """TypeError where `fit` itself is called inside a transformation of JAX."""
+    if is_traced(tree):
+        raise TypeError(
+            f"fit was called inside jit, grad or vmap: {what} hold traced values. It decides on the host after each iteration; call it "
+            "outside. For the derivative of a fitted parameter by the data use the implicit function theorem on the gradient of the loss."
+        )

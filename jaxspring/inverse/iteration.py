@@ -60,13 +60,24 @@ class Objective(eqx.Module):
 
 
 class Checks(eqx.Module):
-    """What the host needs to know of an iteration."""
+    """What the host needs to know of an iteration.
+
+    Attributes:
+        value: the loss.
+        gradient_norm: Euclidean norm of its gradient.
+        is_nonfinite: whether either is NaN or infinite.
+        is_invalid: whether a constructor would refuse the parameters.
+        bad_gradients: per leaf, whether its gradient is NaN or infinite.
+        zeros: tree of the parameters with booleans, where the gradient is exactly zero.
+        is_done: whether the optimiser sees no further progress.
+    """
 
     value: Array
     gradient_norm: Array
     is_nonfinite: Array
     is_invalid: Array
-    is_zero: Array
+    bad_gradients: Array
+    zeros: PyTree
     is_done: Array
 
 
@@ -90,11 +101,12 @@ def iterate(objective: Objective, optimiser: Optimiser, free: PyTree, memory: Py
     largest = jnp.max(jnp.stack([jnp.max(jnp.abs(g), initial=0).astype(done.value.dtype) for g in leaves]))
     scale = jnp.where(largest > 0, largest, jnp.ones_like(largest))
     norm = scale * jnp.sqrt(sum(jnp.sum((g.astype(scale.dtype) / scale) ** 2) for g in leaves))
-    finite = jnp.stack([jnp.isfinite(done.value), *(jnp.all(jnp.isfinite(g)) for g in leaves)])
-    is_zero = jnp.stack([jnp.all(g == 0) for g in leaves])
+    bad_gradients = jnp.stack([~jnp.all(jnp.isfinite(g)) for g in leaves])
+    is_nonfinite = ~jnp.isfinite(done.value) | jnp.any(bad_gradients)
+    zeros = jax.tree.map(lambda g: g == 0, done.gradient)
     bad = [invalid for _, invalid in invalid_effects(objective.parameters(done.at))]
     is_invalid = jnp.any(jnp.stack(bad)) if bad else jnp.zeros((), bool)
-    checks = Checks(done.value, norm, ~jnp.all(finite), is_invalid, is_zero, done.is_done)
+    checks = Checks(done.value, norm, is_nonfinite, is_invalid, bad_gradients, zeros, done.is_done)
     memory = jax.tree.map(_keep_type, memory, done.memory)
     return Report(done.at, jax.tree.map(_keep_type, free, done.after), memory, done.carried, done.info, checks)
 
@@ -120,7 +132,7 @@ def prepare(parameters: PyTree) -> tuple[PyTree, PyTree]:
         return leaf
 
     trained, rest = eqx.partition(jax.tree_util.tree_map_with_path(convert, parameters), eqx.is_inexact_array)
-    if not jax.tree.leaves(trained):
+    if not any(leaf.size for leaf in jax.tree.leaves(trained)):
         raise ValueError("parameters hold no floating-point array, so that there is nothing to train. Convert integers to floats.")
     return trained, rest
 
@@ -149,10 +161,9 @@ def refuse_invalid(parameters: PyTree) -> None:
             raise ValueError(f"{name} has a constant that is NaN or of the wrong sign at the start of the fit. Correct it before fitting.")
 
 
-def warn_of_zero_gradients(free: PyTree, is_zero: np.ndarray) -> None:
+def warn_of_zero_gradients(zeros: PyTree) -> None:
     """GradientWarning naming the leaves whose gradient is exactly zero at the first iteration."""
-    named = jax.tree_util.tree_leaves_with_path(free)
-    idle = [leaf_name(path) for zero, (path, leaf) in zip(is_zero, named, strict=True) if zero and leaf.size]
+    idle = [leaf_name(path) for path, zero in jax.tree_util.tree_leaves_with_path(zeros) if zero.size and np.all(zero)]
     if idle:
         warnings.warn(
             f"The gradient with respect to {', '.join(idle)} is exactly zero at the first iteration: the loss does not depend on it there, "

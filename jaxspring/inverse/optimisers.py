@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import abc
 import contextlib
+import inspect
+import math
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -16,6 +18,9 @@ import jax.numpy as jnp
 import optax
 import optimistix
 from jaxtyping import Array
+
+from ..files import leaf_name
+from ..numerics import cast_inexact
 
 PyTree = Any
 # (free parameters, carried) -> (value or residuals, (carried, info))
@@ -49,6 +54,9 @@ class Evaluation(eqx.Module):
 class Optimiser(eqx.Module):
     """How parameters are improved. Abstract; `Adam`, `LBFGS`, `LeastSquares`, or any optax transformation."""
 
+    # Settings that a resumed fit may change; any other is refused there.
+    may_change: ClassVar[frozenset[str]] = frozenset()
+
     @abc.abstractmethod
     def init(self, objective: Objective, free: PyTree, carried: PyTree) -> PyTree:
         """What the optimiser remembers before the first step."""
@@ -57,9 +65,16 @@ class Optimiser(eqx.Module):
     def step(self, objective: Objective, free: PyTree, memory: PyTree, carried: PyTree) -> Evaluation:
         """Evaluate the objective at `free`, and choose the next point."""
 
+    def linearised(self, objective: Objective, free: PyTree, memory: PyTree, carried: PyTree) -> tuple[Array, Array] | None:
+        """(R,) residuals where the last step came to and (R, P) their derivatives by the raveled coordinates; None where not known."""
+        return None
+
 
 class Optax(Optimiser):
     """Any gradient transformation of optax, such as `optax.adam(0.05)`; `fit` wraps a bare one in this.
+
+    Those that ask for more than the gradient get it: line searches and whatever reads the loss take `value`, `grad`, `value_fn` (and
+    `obj_fn`, the same). Within one iteration a line search holds `carried` fixed.
 
     Attributes:
         transformation: pass the same object again to avoid a new compilation: optax objects compare by identity.
@@ -69,15 +84,27 @@ class Optax(Optimiser):
 
     def init(self, objective: Objective, free: PyTree, carried: PyTree) -> PyTree:
         """The transformation's own state."""
-        with _loose():
+        with _loose(), _named("init"):
             return self.transformation.init(free)
 
     def step(self, objective: Objective, free: PyTree, memory: PyTree, carried: PyTree) -> Evaluation:
-        """One gradient, one update."""
-        (value, (carried, info)), gradient = _value_and_grad(objective, free, carried)
-        with _loose():
-            update, memory = self.transformation.update(gradient, memory, free)
-        return Evaluation(free, value, gradient, _moved(free, update), memory, carried, info, jnp.zeros((), bool))
+        """One gradient, one update, with what the update asks of the loss."""
+        (value, (new_carried, info)), gradient = _value_and_grad(objective, free, carried)
+
+        def value_at(point: PyTree, obj_fn: Any = None) -> Array:
+            # A line search refuses names that value_fn does not take.
+            return objective(point, carried)[0]
+
+        def grad_at(point: PyTree, _: Any) -> PyTree:
+            return jax.grad(value_at)(point)
+
+        extra = {"value": value, "grad": gradient, "value_fn": value_at, "obj_fn": value_at, "grad_fn": grad_at}
+        with _loose(), _named("update"):
+            update_with = optax.with_extra_args_support(self.transformation).update
+            update, new_memory = update_with(gradient, memory, free, **_asked_for(update_with, extra))
+            after = jax.tree.map(lambda p, u: p + u.astype(p.dtype).reshape(p.shape), free, update)
+            jax.tree.map(lambda old, new: None, memory, new_memory)  # refused here, by name, where the structure has changed
+        return Evaluation(free, value, gradient, after, new_memory, new_carried, info, jnp.zeros((), bool))
 
 
 class Adam(Optimiser):
@@ -86,16 +113,24 @@ class Adam(Optimiser):
     Attributes:
         learning_rate: of the first iteration, in unconstrained coordinates (static).
         b1: decay of the mean gradient per iteration (static).
-        decay_over: iterations over which the rate falls; None keeps it (static).
+        decay_over: iterations over which the rate falls; None keeps it (static). A resumed fit may change it, to go on for longer.
         last_fraction: what is left of the rate then (static).
 
     Source: optax.adam, optax.cosine_decay_schedule.
     """
 
+    may_change: ClassVar[frozenset[str]] = frozenset({"decay_over"})
+
     learning_rate: float = eqx.field(static=True, default=0.05)
     b1: float = eqx.field(static=True, default=0.9)
     decay_over: int | None = eqx.field(static=True, default=None)
     last_fraction: float = eqx.field(static=True, default=0.05)
+
+    def __check_init__(self):
+        _expect("learning_rate", self.learning_rate, self.learning_rate > 0, "a positive number")
+        _expect("b1", self.b1, 0 <= self.b1 < 1, "zero or more, and less than one")
+        _expect("decay_over", self.decay_over, self.decay_over is None or self.decay_over >= 1, "1 or more iterations, or None")
+        _expect("last_fraction", self.last_fraction, self.last_fraction >= 0, "zero or more")
 
     def init(self, objective: Objective, free: PyTree, carried: PyTree) -> PyTree:
         """Mean gradient, mean square, count."""
@@ -127,25 +162,21 @@ class LBFGS(Optimiser):
     memory_size: int = eqx.field(static=True, default=10)
     max_line_search_steps: int = eqx.field(static=True, default=20)
 
+    def __check_init__(self):
+        for name in ("memory_size", "max_line_search_steps"):
+            _expect(name, getattr(self, name), getattr(self, name) >= 1, "1 or more")
+
     def init(self, objective: Objective, free: PyTree, carried: PyTree) -> PyTree:
         """The state of optax.lbfgs."""
-        with _loose():
-            return self._transformation().init(free)
+        return self._optax().init(objective, free, carried)
 
     def step(self, objective: Objective, free: PyTree, memory: PyTree, carried: PyTree) -> Evaluation:
         """One gradient, one line search along the quasi-Newton direction."""
-        (value, (new_carried, info)), gradient = _value_and_grad(objective, free, carried)
+        return self._optax().step(objective, free, memory, carried)
 
-        def value_at(point: PyTree) -> Array:
-            return objective(point, carried)[0]
-
-        with _loose():
-            update, new_memory = self._transformation().update(gradient, memory, free, value=value, grad=gradient, value_fn=value_at)
-        return Evaluation(free, value, gradient, _moved(free, update), new_memory, new_carried, info, jnp.zeros((), bool))
-
-    def _transformation(self) -> Any:
+    def _optax(self) -> Optax:
         search = optax.scale_by_zoom_linesearch(max_linesearch_steps=self.max_line_search_steps, initial_guess_strategy="one")
-        return optax.lbfgs(memory_size=self.memory_size, linesearch=search)
+        return Optax(optax.lbfgs(memory_size=self.memory_size, linesearch=search))
 
 
 class LeastSquares(Optimiser):
@@ -163,6 +194,10 @@ class LeastSquares(Optimiser):
     atol: float = eqx.field(static=True, default=1e-8)
     by_reverse_mode: bool = eqx.field(static=True, default=False)
 
+    def __check_init__(self):
+        for name in ("rtol", "atol"):
+            _expect(name, getattr(self, name), getattr(self, name) >= 0, "zero or more")
+
     def init(self, objective: Objective, free: PyTree, carried: PyTree) -> PyTree:
         """Arrays of the solver's state."""
         with _loose():
@@ -170,10 +205,8 @@ class LeastSquares(Optimiser):
 
     def step(self, objective: Objective, free: PyTree, memory: PyTree, carried: PyTree) -> Evaluation:
         """One evaluation; the point moves only where the sum of squares fell."""
-        # The solver's state holds a traced program, compared by identity: only its arrays leave a step, and a fresh state gives the rest.
         with _loose():
-            fresh_arrays, program = eqx.partition(self._fresh(objective, free, carried), eqx.is_array)
-            state = eqx.combine(jax.tree.unflatten(jax.tree.structure(fresh_arrays), memory), program)
+            state = self._state(objective, free, memory, carried)
             solver, options = self._solver()
             at, state, _ = solver.step(objective, free, carried, options, state, frozenset())
         value = 0.5 * jnp.sum(jnp.stack([jnp.sum(r * r) for r in jax.tree.leaves(state.f_info.residual)]))
@@ -181,27 +214,89 @@ class LeastSquares(Optimiser):
         memory = jax.tree.leaves(eqx.filter(state, eqx.is_array))
         return Evaluation(at, value, state.f_info.compute_grad(), at, memory, carried, info, state.terminate)
 
+    @eqx.filter_jit
+    def linearised(self, objective: Objective, free: PyTree, memory: PyTree, carried: PyTree) -> tuple[Array, Array] | None:
+        """Those of the last accepted step."""
+        with _loose():
+            found = self._state(objective, free, memory, carried).f_info
+            return jnp.concatenate([jnp.ravel(r) for r in jax.tree.leaves(found.residual)]), found.jac.as_matrix()
+
+    def _state(self, objective: Objective, free: PyTree, memory: PyTree, carried: PyTree) -> Any:
+        # The solver's state holds a traced program, compared by identity: only its arrays leave a step, and a fresh state gives the rest.
+        fresh_arrays, program = eqx.partition(self._fresh(objective, free, carried), eqx.is_array)
+        return eqx.combine(jax.tree.unflatten(jax.tree.structure(fresh_arrays), memory), program)
+
     def _solver(self) -> tuple[Any, dict[str, Any]]:
         return optimistix.LevenbergMarquardt(self.rtol, self.atol), {"jac": "bwd" if self.by_reverse_mode else "fwd"}
 
     def _fresh(self, objective: Objective, free: PyTree, carried: PyTree) -> Any:
         solver, options = self._solver()
         residual, aux = jax.eval_shape(objective, free, carried)
-        return solver.init(objective, free, carried, options, residual, aux, frozenset())
+        _check_residuals(residual, free)
+        state = solver.init(objective, free, carried, options, residual, aux, frozenset())
+        # The damping starts as a float of JAX's own width; it must not widen the parameters.
+        return eqx.tree_at(lambda s: s.search_state, state, cast_inexact(state.search_state, jax.tree.leaves(free)[0].dtype))
 
 
 def as_optimiser(optimiser: Any) -> Optimiser:
-    """An `Optimiser`: Adam with a learning rate of 0.05 for None, and optax transformations wrapped."""
+    """An `Optimiser`: Adam with a learning rate of 0.05 for None, and optax transformations wrapped.
+
+    Raises:
+        TypeError: something else, such as a class or a function that was not called.
+    """
     if optimiser is None:
         return Adam()
     if isinstance(optimiser, Optimiser):
         return optimiser
+    if isinstance(optimiser, optax.MultiSteps):
+        return Optax(optimiser.gradient_transformation())
     if isinstance(optimiser, optax.GradientTransformation):
         return Optax(optimiser)
-    raise TypeError(
-        f"optimiser is a {type(optimiser).__name__}; expected an optax transformation such as optax.sgd(0.1), or Adam(), LBFGS(), "
-        "LeastSquares()."
-    )
+    is_uncalled = isinstance(optimiser, type) or inspect.isroutine(optimiser)
+    what = f"{optimiser.__name__} itself, which was not called" if is_uncalled else f"a {type(optimiser).__name__}"
+    raise TypeError(f"optimiser is {what}; expected an optax transformation such as optax.sgd(0.1), or Adam(), LBFGS(), LeastSquares().")
+
+
+def _expect(name: str, value: Any, is_right: bool, expected: str) -> None:
+    """ValueError where a setting is not what it must be; NaN never is."""
+    if not is_right or (isinstance(value, float) and not math.isfinite(value)):
+        raise ValueError(f"{name} = {value}; expected {expected}.")
+
+
+def _asked_for(update: Callable[..., Any], extra: dict[str, Any]) -> dict[str, Any]:
+    """What an update takes by name. Most pass on whatever they get; `grad_fn` goes to those alone that name it."""
+    names = inspect.signature(update).parameters
+    takes_all = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in names.values())
+    return {name: value for name, value in extra.items() if name in names or (takes_all and name != "grad_fn")}
+
+
+@contextlib.contextmanager
+def _named(method: str) -> Iterator[None]:
+    """An optimiser's own complaint, with what `fit` gives to it and what else there is."""
+    try:
+        yield
+    except Exception as error:
+        raise TypeError(
+            f"The optimiser's own {method} failed ({type(error).__name__}: {error}). fit gives it the parameters that are trained, the "
+            "gradient of the whole loss, and value, grad, value_fn, obj_fn and grad_fn by name. Optimisers that want other parameters or "
+            "arguments, gradients per example, or a state that changes its structure cannot be used. Use Adam(), LBFGS() or, e.g., "
+            "optax.adamw(0.01)."
+        ) from error
+
+
+def _check_residuals(residuals: PyTree, free: PyTree) -> None:
+    """TypeError where the residuals are no real arrays of the parameters' one type; ValueError where there are none."""
+    dtypes = sorted({str(leaf.dtype) for leaf in jax.tree.leaves(free)})
+    if len(dtypes) > 1:
+        raise TypeError(f"The parameters are of {' and '.join(dtypes)}; least squares needs one type. Cast them, e.g. by astype(float).")
+    leaves = jax.tree_util.tree_leaves_with_path(residuals)
+    for path, leaf in leaves:
+        found = str(getattr(leaf, "dtype", type(leaf).__name__))
+        if found != dtypes[0]:
+            name = f" at {leaf_name(path)}" if path else ""
+            raise TypeError(f"loss returned residuals of {found}{name}, but the parameters are {dtypes[0]}; expected the same. Cast one.")
+    if sum(leaf.size for _, leaf in leaves) == 0:
+        raise ValueError("loss returned no residuals; expected an array, or a tree of arrays, with at least one entry.")
 
 
 @contextlib.contextmanager
@@ -214,15 +309,17 @@ def _loose() -> Iterator[None]:
 def _value_and_grad(objective: Objective, free: PyTree, carried: PyTree) -> Any:
     def scalar(point: PyTree) -> Any:
         value, rest = objective(point, carried)
-        if jnp.shape(value) != () or not jnp.issubdtype(jnp.result_type(value), jnp.floating):
-            raise TypeError(
-                f"loss returned {jax.tree.map(jnp.shape, value)} of {jnp.result_type(value)}; expected one real number. "
-                "For an array of residuals pass optimiser=LeastSquares(); for more results use `carried`."
-            )
-        return value, rest
+        return one_number(value), rest
 
     return jax.value_and_grad(scalar, has_aux=True)(free)
 
 
-def _moved(free: PyTree, update: PyTree) -> PyTree:
-    return jax.tree.map(lambda p, u: p + u.astype(p.dtype), free, update)
+def one_number(value: Any) -> Array:
+    """What a loss returned as a 0-d array; TypeError where it is not one real floating-point number."""
+    advice = "For residuals pass optimiser=LeastSquares() to fit; for more results use its `carried`."
+    if not eqx.is_array_like(value):
+        what = "nothing (None)" if value is None else f"a {type(value).__name__}"
+        raise TypeError(f"loss returned {what}; expected one real number. {advice}")
+    if jnp.shape(value) != () or not jnp.issubdtype(jnp.result_type(value), jnp.floating):
+        raise TypeError(f"loss returned {jnp.shape(value)} of {jnp.result_type(value)}; expected one real number. {advice}")
+    return jnp.asarray(value, jnp.result_type(value))

@@ -33,6 +33,7 @@ LAYERS = {
     "blocks": 6,
     "progress": 6,
     "rollouts": 6,
+    "events": 6,
     "ode": 6,
     "inverse": 7,
     "study": 7,

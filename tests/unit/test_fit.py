@@ -427,7 +427,7 @@ def test_a_checkpoint_of_another_fit_is_refused(tmp_path):
         fit(bowl, jnp.ones(3), checkpoint=place, resume=True)
     with pytest.raises(CheckpointError, match=r"dtype float64; expected shape \(2,\) and dtype float32"):
         fit(bowl, jnp.ones(2, jnp.float32), checkpoint=place, resume=True)
-    with pytest.raises(CheckpointError, match=r"it lacks .* and has"):
+    with pytest.raises(CheckpointError, match=r"its optimiser's type is Adam; expected LBFGS"):
         fit(bowl, jnp.ones(2), LBFGS(), checkpoint=place, resume=True)
 
 

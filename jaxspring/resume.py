@@ -103,7 +103,8 @@ def check_kind(resume: Any) -> None:
         raise TypeError(f"resume is a {type(resume).__name__}; expected the `resume` of an earlier result: resume=result.resume.")
     if resume.step.ndim:
         raise ValueError(
-            f"resume is of a batch of {resume.step.shape} runs. Call rollout inside jax.vmap, with the batch's states and resume as arguments."
+            f"resume is of a batch of {resume.step.shape} runs. Call rollout inside jax.vmap, with the batch's states and resume as its "
+            f"arguments."
         )
 
 

@@ -26,12 +26,13 @@ from .blocks import Adjoint, Checkpointed, Plan, make_plan, run_blocks
 from .linalg.base import SolveInfo
 from .numerics import is_traced, stopped
 from .progress import LONG_RUN, N_CHUNKS, Progress
+from .resume import Origin, Resume, check_kind, checksum, taken_up
 from .state import State
 from .status import EXPLANATION, Flag, StabilityWarning, Status
 from .steppers.base import Stepper
 from .steppers.stability import dt_limit
 from .system import System
-from .watch import Carry, Solves, begin, inspect, settle
+from .watch import Carry, Precision, Solves, begin, inspect, settle
 
 
 class Info(eqx.Module):
@@ -48,14 +49,6 @@ class Info(eqx.Module):
     n_steps: Array
     solves: Solves | None = None
     solves_saved: SolveInfo | None = None
-
-
-class Resume(eqx.Module):
-    """What an unbroken run carries besides its state: pass it to `rollout(resume=...)` to go on bit for bit."""
-
-    start_time: Array
-    step: Array
-    memory: Any
 
 
 class _Job(eqx.Module):
@@ -81,7 +74,7 @@ class Result(eqx.Module):
         saved: states (or whatever `observe` returns) after steps save_every, 2 save_every, ..., stacked on a leading axis; else None.
         status: what went wrong, if anything; see `raise_for_status`.
         info: facts about the run.
-        resume: for going on bit for bit.
+        resume: for going on as if unbroken.
         effects: names of the system's forces and rules, for messages (static).
     """
 
@@ -120,7 +113,8 @@ def rollout(
         adjoint: how reverse mode remembers; `Checkpointed()` unless said, or `StoreStates()`, `StoreAll()`.
         progress: a `Progress` shows a bar and may call the host between chunks of steps.
         check_every: look for trouble every so many steps instead of once per block.
-        resume: the `resume` of an earlier result, to go on as if unbroken.
+        resume: the `resume` of an earlier result, to go on from its `state` as if unbroken. Where dt, a constant or the state has changed
+            since, the stepper starts anew there, and time goes on from the state's.
         keep_solves: keep in each frame how the last solve of an implicit stepper ended, in `info.solves_saved`.
 
     Returns:
@@ -129,7 +123,8 @@ def rollout(
 
     Raises:
         ValueError: n_steps or save_every that do not fit, a dt that is not finite, a negative one where the stepper does not run backward,
-            `observe` without `save_every`.
+            `observe` without `save_every`, a `resume` of another stepper, dtype, topology or list of effects, or of a batch.
+        TypeError: a `resume` that is none.
 
     >>> import jaxspring as js
     >>> net = js.lattice(2)
@@ -146,7 +141,8 @@ def rollout(
         if np.asarray(dt) < 0 and not stepper.runs_backward:
             raise ValueError(f"dt = {dt}, but {type(stepper).__name__} does not run backward. Use VelocityVerlet(), or a positive dt.")
     plan = make_plan(n_steps, save_every, Checkpointed() if adjoint is None else adjoint, check_every)
-    resume = Resume(state.time, jnp.zeros((), jnp.int32), _Unset()) if resume is None else resume
+    if resume is not None:
+        check_kind(resume)
     job = _Job(stepper, dt, observe, plan, keep_solves)
     if is_traced(system, state, resume, job):
         return _compiled(system, state, resume, job, progress)
@@ -173,29 +169,53 @@ def _warn(result: Result, dt: Array) -> None:
 
 
 class _Begun(eqx.Module):
-    """What is made once, before the first step: constants as the loop wants them, the memory of the stepper, what is wrong already."""
+    """What is made once, before the first step: constants as the loop wants them, the memory of the stepper, what is wrong already.
+
+    Attributes:
+        ready: the prepared system.
+        state: where the steps start.
+        resume: with the stepper's memory.
+        limit: largest stable dt [s], or None.
+        status: what is wrong before the first step.
+        precise: how far coordinates may grow before rounding is looked at.
+        is_fresh: whether no earlier run goes on here (static): steps are then counted from zero.
+    """
 
     ready: System
     state: State
     resume: Resume
     limit: Array | None
     status: Status
+    precise: Precision
+    is_fresh: bool = eqx.field(static=True)
 
     def at(self, result: Result) -> _Begun:
         """The same where a part of the run has ended."""
         return eqx.tree_at(lambda b: (b.state, b.resume, b.status), self, (result.state, result.resume, Status.ok()))
 
 
-def _begin(system: System, state: State, resume: Resume, job: _Job) -> _Begun:
+def _begin(system: System, state: State, resume: Resume | None, job: _Job) -> _Begun:
     ready = system.prepare(state.dtype)
     start = ready.begin(state)
     still, still_start = stopped((ready, start))
     limit = dt_limit(still, still_start, job.stepper)
-    memory = job.stepper.init(ready, start) if isinstance(resume.memory, _Unset) else resume.memory
-    status = begin(system, ready, Carry(start, memory, resume.step), job.dt, limit)
+    if resume is None:
+        taken = _fresh(system, ready, state, start, job)
+    else:
+        taken = taken_up(resume, system, ready, state, start, job.stepper, job.dt)
+    precise = Precision.of(ready, start)
+    status = begin(system, ready, precise, Carry(start, taken.memory, taken.step), job.dt, limit)
     if not job.stepper.runs_backward:
-        status = status.then(Status.when(Flag.INVALID, stopped(job.dt) < 0, step=resume.step))
-    return _Begun(ready, start, Resume(resume.start_time, resume.step, memory), limit, status)
+        status = status.then(Status.when(Flag.INVALID, stopped(job.dt) < 0, step=taken.step))
+    return _Begun(ready, start, taken, limit, status, precise, resume is None)
+
+
+def _fresh(system: System, ready: System, state: State, start: State, job: _Job) -> Resume:
+    """Where nothing goes on."""
+    zero = jnp.zeros((), jnp.int32)
+    memory, origin = job.stepper.init(ready, start), Origin.of(system, state, job.stepper)
+    constants = checksum((system, job.stepper))
+    return Resume(state.time, zero, zero, state.time, job.dt, memory, constants, jnp.zeros((), jnp.uint32), origin)
 
 
 def _proceed(begun: _Begun, job: _Job, progress: Progress | None = None) -> Result:
@@ -206,37 +226,50 @@ def _proceed(begun: _Begun, job: _Job, progress: Progress | None = None) -> Resu
         raise ValueError("keep_solves keeps how an implicit stepper's solves ended in each frame: pass save_every and an implicit stepper.")
     found = Status.ok() if ready.followers else None
     carry = Carry(begun.state, resume.memory, resume.step, None if info is None else Solves.none(info), found)
-
-    advance = partial(_advance, ready, job.stepper, job.dt, resume.start_time)
+    clock = _Clock(resume.start_time, None if begun.is_fresh else resume.start_step, job.dt)
 
     def report(carry: Carry) -> None:
         if progress is not None:
-            jax.debug.callback(partial(progress.update, total=job.plan.n_steps), carry.step)
+            jax.debug.callback(partial(progress.update, total=job.plan.n_steps), carry.step - resume.step)
 
     first = stopped(carry)
-    (carry, status), frames = run_blocks(advance, partial(inspect, ready), job.keep, report, (carry, begun.status), job.plan)
+    advance, look = partial(_advance, ready, job.stepper, clock), partial(inspect, ready, begun.precise)
+    (carry, status), frames = run_blocks(advance, look, job.keep, report, (carry, begun.status), job.plan)
     saved, solves_saved = (None, None) if frames is None else frames
     if carry.solves is None:
         # The replay of a failed run is not part of what is differentiated.
-        still_dt, still_time = stopped((job.dt, resume.start_time))
-        status = settle(partial(_advance, still, job.stepper, still_dt, still_time), first, status, still)
+        status = settle(partial(_advance, still, job.stepper, stopped(clock)), first, status, still)
     else:
         # An implicit step looks at itself, so that nothing need be replayed. What was wrong before the first step comes first.
-        at_start = status.step == 0
+        at_start = status.step == resume.step
         status = status.only_if(at_start).then(carry.solves.status).then(status.only_if(~at_start))
     if carry.found is not None:
         status = status.then(carry.found)
+    reached = (carry.step, carry.state.time, job.dt, carry.memory, checksum(carry.state))
     return Result(
         state=carry.state,
         saved=saved,
         status=_in_user_order(status, begun.state),
         info=Info(limit, carry.step, carry.solves, solves_saved),
-        resume=Resume(resume.start_time, carry.step, carry.memory),
+        resume=eqx.tree_at(lambda r: (r.step, r.time, r.dt, r.memory, r.state), resume, reached, is_leaf=lambda leaf: leaf is None),
         effects=ready.effects,
     )
 
 
-def _run(system: System, state: State, resume: Resume, job: _Job, progress: Progress | None = None) -> Result:
+class _Clock(eqx.Module):
+    """Time by the count of steps: t = t0 + (i - i0) dt; `start_step` i0 is None where it is zero."""
+
+    start_time: Array
+    start_step: Array | None
+    dt: Array
+
+    def at(self, index: Array) -> Array:
+        """Time after so many steps [s]."""
+        n_steps = index if self.start_step is None else index - self.start_step
+        return self.start_time + n_steps.astype(self.dt.dtype) * self.dt
+
+
+def _run(system: System, state: State, resume: Resume | None, job: _Job, progress: Progress | None = None) -> Result:
     """The whole run as one traced program."""
     return _proceed(_begin(system, state, resume, job), job, progress)
 
@@ -250,10 +283,10 @@ def _in_user_order(status: Status, state: State) -> Status:
     return eqx.tree_at(lambda s: s.node, status, jnp.where(status.node >= 0, named, status.node))
 
 
-def _advance(system: System, stepper: Stepper, dt: Array, start_time: Array, carry: Carry) -> Carry:
-    index = carry.step + 1
+def _advance(system: System, stepper: Stepper, clock: _Clock, carry: Carry) -> Carry:
+    index, dt = carry.step + 1, clock.dt
     state, memory = stepper.step(system, carry.state, dt, carry.memory)
-    state = eqx.tree_at(lambda s: s.time, state, start_time + index.astype(dt.dtype) * dt)
+    state = eqx.tree_at(lambda s: s.time, state, clock.at(index))
     info = stopped(stepper.report(memory))
     solves = carry.solves if carry.solves is None or info is None else carry.solves.then(info, index)
     state = state if system.motion is None else system.constrain(state)
@@ -269,7 +302,7 @@ _compiled_begin = eqx.filter_jit(_begin)
 _compiled_proceed = eqx.filter_jit(_proceed)
 
 
-def _run_eagerly(system: System, state: State, resume: Resume, job: _Job, progress: Progress | None) -> Result:
+def _run_eagerly(system: System, state: State, resume: Resume | None, job: _Job, progress: Progress | None) -> Result:
     """The run in chunks, with the host between them where somebody watches or the run is long."""
     plan = job.plan
     # A piece costs some passes over the state: without a watcher each is long enough for that not to show.
@@ -277,28 +310,30 @@ def _run_eagerly(system: System, state: State, resume: Resume, job: _Job, progre
     pieces = plan.pieces(n_pieces)
     if len(pieces) == 1 and progress is None:
         return _compiled(system, state, resume, job)
-    result: Any = None
-    frames, done = [], 0
     begun = _compiled_begin(system, state, resume, job)
+    # One name, so that Ctrl-C at any moment finds the result and its frames together.
+    so_far: tuple[Any, tuple[Any, ...], int] = (None, (), 0)
     try:
         for piece in pieces:
-            latest = _compiled_proceed(begun, replace(job, plan=piece))
+            result, frames, done = so_far
+            latest = _compiled_proceed(begun if result is None else begun.at(result), replace(job, plan=piece))
             if len(pieces) > 1 or progress is not None:
                 jax.block_until_ready(latest)
+            frame = (latest.saved, latest.info.solves_saved)
             if result is not None:
                 latest = eqx.tree_at(lambda r: (r.status, r.info), latest, (result.status.then(latest.status), _joined(result, latest)))
-            result, begun, done = latest, begun.at(latest), done + piece.n_steps
-            frames.append((latest.saved, latest.info.solves_saved))
+            so_far = (latest, (*frames, frame), done + piece.n_steps)
             if progress is not None:
-                progress.update(done, plan.n_steps)
+                progress.update(so_far[2], plan.n_steps)
     except KeyboardInterrupt:
-        if result is None:
+        if so_far[0] is None:
             raise
-        stopped_here = Status.when(Flag.INTERRUPTED, True, step=result.resume.step)
-        result = eqx.tree_at(lambda r: r.status, result, result.status.then(stopped_here))
+        stopped_here = Status.when(Flag.INTERRUPTED, True, step=so_far[0].resume.step)
+        so_far = (eqx.tree_at(lambda r: r.status, so_far[0], so_far[0].status.then(stopped_here)), *so_far[1:])
+    result, frames, _ = so_far
     if len(frames) > 1 and plan.save_every is not None:
-        saved = jax.tree.map(lambda *parts: jnp.concatenate(parts), *frames)
-        result = Result(result.state, saved[0], result.status, replace(result.info, solves_saved=saved[1]), result.resume, result.effects)
+        saved, solves_saved = jax.tree.map(lambda *parts: jnp.concatenate(parts), *frames)
+        result = replace(result, saved=saved, info=replace(result.info, solves_saved=solves_saved))
     return result
 
 
@@ -307,10 +342,6 @@ def _joined(first: Result, latest: Result) -> Info:
     if solves is not None and first.info.solves is not None:
         solves = first.info.solves.joined(solves)
     return Info(first.info.stable_dt, latest.info.n_steps, solves, latest.info.solves_saved)
-
-
-class _Unset(eqx.Module):
-    """A stepper's memory that is not made yet."""
 
 
 def _check_steps(n_steps: int, save_every: int | None, observe: Any, check_every: int | None) -> None:

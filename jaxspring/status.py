@@ -136,20 +136,43 @@ class Status(eqx.Module):
         """Whether `flag` was raised."""
         return (self.flags & jnp.asarray(int(flag), jnp.uint32)) != jnp.asarray(0, jnp.uint32)
 
-    def describe(self, effects: tuple[str, ...] = ()) -> str:
-        """One line a person can act on. Not for traced values."""
-        flags = Flag(int(np.bitwise_or.reduce(np.ravel(np.asarray(self.flags)))))
-        if flags == Flag.OK:
+    def describe(self, effects: tuple[str, ...] = (), step_word: str = "step") -> str:
+        """What went wrong, errors before warnings: of a batch in how many lanes, and the place in the first lane that failed.
+
+        Args:
+            effects: names of the forces and rules, in the order of their indices.
+            step_word: what a step is called, such as "iteration".
+
+        Not for traced values.
+        """
+        flags = np.asarray(self.flags)
+        errors, warned = (flags & int(~WARNINGS & 0xFFFFFFFF)) != 0, (flags & int(WARNINGS)) != 0
+        if not np.any(flags):
             return "OK"
-        first = int(np.argmax(np.ravel(np.asarray(self.flags)) != 0))
-        step, node, effect, count = (int(np.ravel(np.asarray(a))[first]) for a in (self.step, self.node, self.effect, self.count))
-        place = [f"step {step}"] if step != NOWHERE else []
+        is_bad = errors if np.any(errors) else warned
+        first = tuple(int(i) for i in np.argwhere(is_bad)[0])
+        place = self._place(first, effects, step_word)
+        found = [flag for flag in Flag if flag and np.any(flags & int(flag))]
+        found.sort(key=lambda flag: flag in WARNINGS)
+        if not flags.ndim:
+            names = "; ".join(f"{flag.name}: {EXPLANATION[flag]}" for flag in found)
+            return names + (f" (first at {', '.join(place)})" if place else "")
+        counts = "; ".join(f"{flag.name} in {np.sum((flags & int(flag)) != 0)}: {EXPLANATION[flag]}" for flag in found)
+        own = " and ".join(flag.name or "" for flag in found if flags[first] & int(flag))
+        lane = first[0] if len(first) == 1 else first
+        alarms = f"{errors.sum()} of {flags.size} lanes failed" if np.any(errors) else "no lane failed"
+        alarms += f", {warned.sum()} of {flags.size} warn" if np.any(warned) else ""
+        return f"{alarms}. {counts} (first {'failing' if np.any(errors) else 'warning'} lane: {', '.join([f'lane {lane}', own, *place])})"
+
+    def _place(self, lane: tuple[int, ...], effects: tuple[str, ...], step_word: str) -> list[str]:
+        """Step, node, effect and count of one lane, as far as they are known."""
+        step, node, effect, count = (int(np.asarray(a)[lane]) for a in (self.step, self.node, self.effect, self.count))
+        place = [f"{step_word} {step}"] if step != NOWHERE else []
         place += [f"node {node}"] if node != NOWHERE else []
-        place += [f"effect {effects[effect] if effect < len(effects) else effect}"] if effect != NOWHERE else []
-        place += [f"lane {first}"] if np.ndim(self.flags) else []
-        place += [f"count {count}"] if count > 1 else []
-        names = "; ".join(f"{flag.name}: {EXPLANATION[flag]}" for flag in Flag if flag and flag in flags)
-        return names + (f" (first at {', '.join(place)})" if place else "")
+        if effect != NOWHERE:
+            name = effects[effect] if effect < len(effects) else str(effect)
+            place += [f"effect {effect} ({name})" if effects.count(name) > 1 else f"effect {name}"]
+        return place + ([f"count {count}"] if count > 1 else [])
 
 
 class SimulationError(RuntimeError):
@@ -171,7 +194,9 @@ def raise_for_status(result: Any) -> None:
     note = getattr(result, "effects", ())
     if not bool(np.all(np.asarray(status.is_ok))):
         hint = getattr(getattr(result, "info", None), "stable_dt", None)
-        least = np.inf if hint is None else float(np.min(np.asarray(hint)))
+        # Of the lane that the text names.
+        failed = np.argwhere(~np.asarray(status.is_ok))[0]
+        least = np.inf if hint is None else float(np.broadcast_to(np.asarray(hint), np.shape(status.flags))[tuple(failed)])
         limit = f" The stability limit of this run was dt = {least:.6g}." if np.isfinite(least) else ""
         raise SimulationError((getattr(result, "explanation", "") or status.describe(note)) + "." + limit)
     if bool(np.any(np.asarray(status.flags) != 0)):

@@ -18,10 +18,13 @@ from jax import lax
 from jaxtyping import Array
 
 from .linalg.base import SolveInfo
-from .numerics import cast_inexact, stopped
+from .numerics import any_lane, cast_inexact, stopped
 from .state import State
 from .status import NOWHERE, Flag, Status
 from .system import System
+
+# Forces good to three digits or worse: the threshold is a choice.
+_SPOILT = 1e-3
 
 
 class Solves(eqx.Module):
@@ -69,14 +72,49 @@ class Carry(eqx.Module):
     found: Status | None = None
 
 
-def begin(system: System, ready: System, carry: Carry, dt: Array, limit: Array | None) -> Status:
+class Precision(eqx.Module):
+    """How far the coordinates may grow before their rounding is looked at again.
+
+    Attributes:
+        errors: relative error of each force at the start of the run; None where it takes no difference.
+        size: largest coordinate then [m].
+    """
+
+    errors: tuple[Array | None, ...]
+    size: Array
+
+    @staticmethod
+    def of(ready: System, state: State) -> Precision:
+        """At the start of a run."""
+        return stopped(Precision(tuple(force.rounding(state) for force in ready.forces), _largest(state)))
+
+    def look(self, ready: System, carry: Carry) -> Status:
+        """PRECISION where coordinates have grown too large for a force.
+
+        Springs are measured only where the coordinates come within a tenth of what the lengths at the start allow.
+        """
+        ready, carry = stopped((ready, carry))
+        grown = _largest(carry.state) / self.size
+        status = Status.ok()
+        for i, error in enumerate(self.errors):
+            if error is None:
+                continue
+            # NaN, where all coordinates were zero, counts as near.
+            is_near = any_lane(~(error * grown <= _SPOILT / 10))
+            force, nothing = ready.forces[i], jnp.zeros_like(error)
+            now = lax.cond(is_near, lambda state, force=force: force.rounding(state), lambda _, none=nothing: none, carry.state)
+            status = status.then(Status.when(Flag.PRECISION, now > _SPOILT, step=carry.step, effect=i))
+        return status
+
+
+def begin(system: System, ready: System, precise: Precision, carry: Carry, dt: Array, limit: Array | None) -> Status:
     """Before the first step: constants that a constructor would refuse, a state that is not finite, a dt above the limit, and
-    coordinates too large for the springs between them. The constants are read as the user gave them (`system`), which is one array
-    where the prepared system (`ready`) holds one for every spring family.
+    coordinates too large for the springs between them. The constants are read as the user gave them, which is one array where the prepared
+    system (`ready`) holds one for every spring family.
     """
     if not jax.config.jax_enable_x64:
         system = cast_inexact(system, carry.state.dtype)  # constants of float64, made before x64 was switched off
-    system, ready, carry, dt, limit = stopped((system, ready, carry, dt, limit))
+    system, carry, dt, limit = stopped((system, carry, dt, limit))
     # Masses first: gravity holds them too, and would be blamed.
     status = Status.when(Flag.INVALID, ~jnp.all(system.mass > 0), step=carry.step)
     status = status.then(Status.when(Flag.NONFINITE, _has_nonfinite(system.mass), step=carry.step))
@@ -86,22 +124,20 @@ def begin(system: System, ready: System, carry: Carry, dt: Array, limit: Array |
         if bad is not None:
             status = status.then(Status.when(Flag.INVALID, bad, step=carry.step, effect=i))
         status = status.then(Status.when(Flag.NONFINITE, _has_nonfinite(effect), step=carry.step, effect=i))
-        rounding = ready.forces[i].rounding(carry.state) if i < len(ready.forces) else None
-        if rounding is not None:
-            # Forces good to three digits or worse: the threshold is a choice.
-            status = status.then(Status.when(Flag.PRECISION, rounding > 1e-3, step=carry.step, effect=i))
+        error = precise.errors[i] if i < len(precise.errors) else None
+        if error is not None:
+            status = status.then(Status.when(Flag.PRECISION, error > _SPOILT, step=carry.step, effect=i))
     status = status.then(look(ready, carry))
     if limit is not None:
         # A hair of slack: a dt set to the limit itself is not above it after rounding.
         slack = jnp.asarray(1 + 8 * float(jnp.finfo(limit.dtype).eps), limit.dtype)
         status = status.then(Status.when(Flag.DT_LIMIT, jnp.abs(dt) > limit * slack, step=carry.step))
-    is_first = carry.step == 0
-    return lax.stop_gradient(status.only_if(is_first))
+    return lax.stop_gradient(status)
 
 
-def inspect(system: System, after: Carry, status: Status) -> Status:
+def inspect(system: System, precise: Precision, after: Carry, status: Status) -> Status:
     """The status brought up to date at the end of a block."""
-    return status.then(look(system, after))
+    return status.then(look(system, after)).then(precise.look(system, after))
 
 
 def look(system: System, carry: Carry) -> Status:
@@ -132,7 +168,7 @@ def settle(advance: Callable[[Carry], Carry], first: Carry, status: Status, syst
         # A spring may be too long for its square in a state that is finite.
         return jax.tree.map(partial(jnp.where, jnp.any(bad)), found, known)
 
-    has_failed = status.has(Flag.NONFINITE) & (status.step > 0)
+    has_failed = status.has(Flag.NONFINITE) & (status.step > first.step)
     step, node, effect = lax.cond(has_failed, replay, lambda _: known, None)
     return lax.stop_gradient(Status(status.flags, step, node, effect, status.count))
 
@@ -157,6 +193,10 @@ def _has_nonfinite(constants: Any) -> Array:
     for leaf in jax.tree.leaves(eqx.filter(constants, eqx.is_inexact_array)):
         bad = bad | ~jnp.all(jnp.isfinite(leaf))
     return bad
+
+
+def _largest(state: State) -> Array:
+    return jnp.max(jnp.stack([jnp.max(jnp.abs(a)) for a in state.position]))
 
 
 def _nonfinite(state: State) -> Array:

@@ -12,6 +12,7 @@ LAYERS = {
     "_arrays": 0,
     "_checks": 0,
     "numerics": 0,
+    "facts": 0,
     "status": 0,
     "vector": 0,
     "archive": 0,  # files of arrays, whole or not at all
@@ -29,9 +30,10 @@ LAYERS = {
     "steppers": 5,
     "equilibrium": 5,
     "modes": 5,
-    "watch": 6,  # watch, blocks and progress are the parts of a rollout
+    "watch": 6,  # watch, blocks, progress and resume are the parts of a rollout
     "blocks": 6,
     "progress": 6,
+    "resume": 6,
     "rollouts": 6,
     "events": 6,
     "ode": 6,

@@ -1,0 +1,110 @@
+"""What of an object is fixed when a program is compiled, as text: types, shapes, options, and functions by what they say.
+
+Text is compared where objects cannot be: between processes, after pickling, and where a function was written anew but says the same.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import functools
+import hashlib
+import types
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import numpy as np
+from jax.core import Tracer
+
+Fact = tuple[str, str]
+# Deeper than any object of the library: a user's object may hold itself.
+_DEPTH = 16
+_PLAIN = (bool, int, float, complex, str, bytes, type(None), enum.Enum, np.dtype, np.generic, slice)
+
+
+def facts(value: Any, path: str = "") -> tuple[Fact, ...]:
+    """The facts about a value, each with the path where it stands, such as ("solver.tolerance", "1e-08").
+
+    Of an array only shape and type, since its numbers may be traced; of one that is an option or that a function holds, its numbers too.
+    """
+    return tuple(_facts(value, path, False, _DEPTH))
+
+
+def digest(found: tuple[Fact, ...]) -> str:
+    """Facts as a short text: equal where they are."""
+    return hashlib.sha256(repr(found).encode()).hexdigest()[:32]
+
+
+def _facts(value: Any, path: str, is_fixed: bool, depth: int) -> Iterator[Fact]:
+    if depth == 0:
+        return
+    if isinstance(value, jax.Array | np.ndarray):
+        yield path, _of_array(value, is_fixed)
+    elif isinstance(value, _PLAIN):
+        yield path, repr(value)
+    elif isinstance(value, type):
+        yield path, _name(value)
+    elif isinstance(value, tuple | list):
+        yield path, f"{type(value).__name__} of {len(value)}"
+        for i, entry in enumerate(value):
+            yield from _facts(entry, f"{path}[{i}]", is_fixed, depth - 1)
+    elif isinstance(value, dict):
+        for key in sorted(value, key=repr):
+            yield from _facts(value[key], f"{path}[{key!r}]", is_fixed, depth - 1)
+    elif callable(value) and not dataclasses.is_dataclass(value):
+        yield from _of_function(value, path, depth)
+    else:
+        yield path, _name(type(value))
+        for name, part, fixed in _parts(value):
+            yield from _facts(part, f"{path}.{name}" if path else name, is_fixed or fixed, depth - 1)
+
+
+def _parts(value: Any) -> Iterator[tuple[str, Any, bool]]:
+    """Fields of an object, and whether each is fixed when a program is compiled."""
+    if not dataclasses.is_dataclass(value):
+        yield from ((name, part, True) for name, part in sorted(getattr(value, "__dict__", {}).items()))
+        return
+    # An object that JAX does not know is a leaf, and as a whole fixed.
+    is_tree = not any(leaf is value for leaf in jax.tree.leaves(value))
+    for field in dataclasses.fields(value):
+        if hasattr(value, field.name):
+            yield field.name, getattr(value, field.name), not is_tree or field.metadata.get("static", False)
+
+
+def _of_array(value: Any, is_fixed: bool) -> str:
+    kind = f"{value.dtype}{tuple(value.shape)}"
+    if not is_fixed or isinstance(value, Tracer) or jax.dtypes.issubdtype(value.dtype, jax.dtypes.extended):
+        return kind
+    return f"{kind} {hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()[:16]}"
+
+
+def _of_function(function: Any, path: str, depth: int) -> Iterator[Fact]:
+    """Its name, its code and what it holds; what it reads from its module is taken to stay as it is."""
+    name = getattr(function, "__qualname__", _name(type(function)))
+    yield path, f"{name} {_of_code(function.__code__)}" if isinstance(function, types.FunctionType) else name
+    if isinstance(function, functools.partial):
+        inner: Any = (function.func, function.args, function.keywords)
+    elif isinstance(function, types.MethodType):
+        inner = (function.__func__, function.__self__)
+    elif isinstance(function, types.FunctionType):
+        inner = (function.__defaults__, function.__kwdefaults__, tuple(_content(cell) for cell in function.__closure__ or ()))
+    else:
+        inner = getattr(function, "__wrapped__", None)
+    yield from _facts(inner, f"{path}()", True, depth - 1)
+
+
+def _of_code(code: types.CodeType) -> str:
+    constants = [_of_code(c) if isinstance(c, types.CodeType) else repr(c) for c in code.co_consts]
+    return hashlib.sha256(repr((code.co_code, code.co_names, constants)).encode()).hexdigest()[:16]
+
+
+def _content(cell: Any) -> Any:
+    try:
+        return cell.cell_contents
+    except ValueError:  # not filled yet
+        return None
+
+
+def _name(kind: type) -> str:
+    return f"{kind.__module__}.{kind.__qualname__}"

@@ -40,9 +40,10 @@ class Flag(enum.IntFlag):
     PRECISION = 32768
     SOLVER = 65536
     UNSTABLE = 131072
+    IMPACTS = 262144
 
 
-WARNINGS = Flag.COINCIDENT | Flag.OVERLAP | Flag.OUTSIDE | Flag.DT_LIMIT | Flag.PRECISION
+WARNINGS = Flag.COINCIDENT | Flag.OVERLAP | Flag.OUTSIDE | Flag.DT_LIMIT | Flag.PRECISION | Flag.IMPACTS
 
 EXPLANATION = {
     Flag.NONFINITE: "a position, velocity or temperature is NaN or infinite; try a smaller dt (see stable_dt), or look for a bad parameter",
@@ -62,6 +63,7 @@ EXPLANATION = {
     Flag.PRECISION: "rounding of such large coordinates spoils the springs' forces; move the scene to the origin, or use float64",
     Flag.SOLVER: "the solver gave up: its solve did not reach the accuracy it needs, or its step shrank to the least allowed",
     Flag.UNSTABLE: "the forces balance, but the shape is no minimum of the energy: a small push makes it buckle; start from one",
+    Flag.IMPACTS: "a node met more obstacles in one step than are followed, and waited at the last one; lower dt",
     Flag.INVALID: "a parameter has a value that its constructor would refuse (sign, NaN or infinity)",
 }
 

@@ -17,6 +17,7 @@ import jax
 import numpy as np
 
 from ...archive import atomic_folder
+from ...forces.base import Step
 from ...progress import Progress, Stopwatch
 from ...rollouts import Result, rollout
 from ...state import State
@@ -139,7 +140,7 @@ def seconds_per_effect(scene: Melting, end: State, repeats: int = 10) -> dict[st
     for force in ready.forces:
         found[type(force).__name__] = _fastest(eqx.filter_jit(lambda f, s: f.force(s)), (force, end), repeats)
     for rule in rules:
-        found[type(rule).__name__] = _fastest(eqx.filter_jit(lambda r, s: r.update(s, s, dt)), (rule, end), repeats)
+        found[type(rule).__name__] = _fastest(eqx.filter_jit(lambda r, s: r.update(Step(s, s, dt), s)), (rule, end), repeats)
     return found
 
 

@@ -71,6 +71,10 @@ class VelocityVerlet(Stepper):
         a_new = system.acceleration(predicted)
         return state.moved(x, state.velocity + (0.5 * dt) * (a + a_new)), a_new
 
+    def after_rules(self, system: System, before: State, moved: State, now: State, dt: Array, memory: Vector) -> Vector:
+        """The acceleration where the rules have left the nodes."""
+        return system.acceleration(now)
+
     def limit(self, squared_frequency: Array, damping: Array, damping_floor: Array) -> Array:
         """2 / (c + sqrt(c^2 + w^2))."""
         return _ratio(jnp.full_like(damping, 2), damping + jnp.sqrt(damping * damping + squared_frequency))

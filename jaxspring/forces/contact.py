@@ -108,12 +108,15 @@ def strike(floors: tuple[Rule, ...], step: Step, state: State, books: bool = Fal
     scene, path = _begun(planes, step, books)
     path, unfinished = scene.follow(path)
     end, velocity = scene.end(path)
-    shift, kick = end.position - moved.position, velocity - moved.velocity
+    position, velocity = _where(path.is_struck, end.position, moved.position), _where(path.is_struck, velocity, moved.velocity)
     if step.by_velocity is not None:
-        shift, kick = _damped(scene, path, end.held, step, shift, kick)
-    else:
-        shift, kick = _where(path.is_struck, shift), _where(path.is_struck, kick)
-    after = state.moved(state.position + shift, state.velocity + kick)
+        position, velocity = _damped(scene, path, end.held, step, position, velocity)
+    # Another rule may have moved or kicked nodes since: then what the impacts change is added to that.
+    if state.position is not moved.position:
+        position = state.position + (position - moved.position)
+    if state.velocity is not moved.velocity:
+        velocity = state.velocity + (velocity - moved.velocity)
+    after = state.moved(position, velocity)
     status = Status.when(Flag.INVALID, step.dt < 0)
     if len(planes) > 1:
         node = jnp.argmax(jnp.ravel(unfinished)).astype(jnp.int32)
@@ -177,26 +180,26 @@ def _goes_first(a: tuple[Array, ...], b: tuple[Array, ...], otherwise: bool) -> 
     return first | (same & otherwise)
 
 
-def _damped(scene: Impacts, path: Path, held: tuple[Array, ...], step: Step, shift: Vector, kick: Vector) -> tuple[Vector, Vector]:
-    """The changes of position and velocity with what forces that depend on velocity do otherwise after the impacts.
+def _damped(scene: Impacts, path: Path, held: tuple[Array, ...], step: Step, position: Vector, velocity: Vector) -> tuple[Vector, Vector]:
+    """Positions and velocities with what forces that depend on velocity do otherwise after the impacts.
 
     A change of velocity J with a time r left gives the accelerations F(v + J) - F(v), over mass, for that time: exactly where they are
     linear, whose parts add up; what is beyond that counts for the node itself.
     """
     if path.first is None or path.moments is None or step.by_velocity is None:
-        return shift, kick
-    moved, (then, impulse, left) = step.moved, path.first
-    at = moved.velocity.map(lambda now, there: jnp.where(path.is_struck, there, now), then)
+        return position, velocity
+    then, impulse, left = path.first
+    at = _where(path.is_struck, then, step.moved.velocity)
     force, linear = jax.linearize(step.by_velocity, at)
     bend = step.by_velocity(at + impulse) - force - linear(impulse)
     basis = scene.basis(held)
-    shift = _where(path.is_struck, shift) + without(linear(path.moments[1]) + (0.5 * left * left) * bend, basis)
-    kick = _where(path.is_struck, kick) + without(linear(path.moments[0]) + left * bend, basis)
-    return scene.lifted(moved.position, shift), kick
+    position = position + without(linear(path.moments[1]) + (0.5 * left * left) * bend, basis)
+    velocity = velocity + without(linear(path.moments[0]) + left * bend, basis)
+    return scene.lifted(position), velocity
 
 
-def _where(condition: Array, v: Vector) -> Vector:
-    return v.map(lambda a: jnp.where(condition, a, jnp.zeros_like(a)))
+def _where(condition: Array, v: Vector, otherwise: Vector) -> Vector:
+    return v.map(lambda a, b: jnp.where(condition, a, b), otherwise)
 
 
 def _pick_vector(chosen: tuple[Array, ...], values: tuple[Vector, ...]) -> Vector:

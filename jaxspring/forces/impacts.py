@@ -146,7 +146,7 @@ class Impacts(eqx.Module):
 
         def sweep(carry: tuple[Path, Array], _: None) -> tuple[tuple[Path, Array], None]:
             path, goes_on = carry
-            return lax.cond(any_lane(goes_on), self.strike, lambda path: (path, goes_on), path), None
+            return lax.cond(any_lane(goes_on), lambda p: self.strike(p), lambda p: (p, goes_on), path), None
 
         path = dataclasses.replace(path, held=tuple(jnp.zeros_like(path.is_struck) for _ in self.planes))
         (path, goes_on), _ = lax.scan(sweep, (path, jnp.ones((), bool)), None, length=MOST)
@@ -238,12 +238,12 @@ class Impacts(eqx.Module):
             position = position + self.lever(plane.normal, off)[0] * jnp.where(is_held, off, jnp.zeros_like(off))
         return dataclasses.replace(gone, position=position), velocity
 
-    def lifted(self, position: Vector, shift: Vector) -> Vector:
-        """The shift that leaves no node below a plane."""
+    def lifted(self, position: Vector) -> Vector:
+        """The positions, none of them below a plane."""
         for plane, base in zip(self.planes, self.base, strict=True):
-            depth = plane.height(position + shift) - base
-            shift = shift - self.lever(plane.normal, depth)[0] * jnp.minimum(depth, jnp.zeros_like(depth))
-        return shift
+            depth = plane.height(position) - base
+            position = position - jnp.minimum(depth, jnp.zeros_like(depth)) * self.lever(plane.normal, depth)[0]
+        return position
 
     def lever(self, normal: Vector, like: Array) -> tuple[Vector, Array]:
         """Change of velocity per unit of change along a normal, where nodes are free, and its length: the normal, and 1, of free nodes."""
@@ -282,15 +282,15 @@ class Impacts(eqx.Module):
         if work is not None and given is not None:
             at = path.velocity.map(lambda w, o: jnp.where(hit.rests, w + o, w), self.offset)
             work = tuple(b + jnp.where(c, kick.dot(at + 0.5 * kick), jnp.zeros_like(b)) for b, c in zip(work, chosen, strict=True))
-            is_bounce = ~hit.rests
-            given = tuple(
-                b + hit.bounce * jnp.where(c & is_bounce, jnp.ones_like(path.left), jnp.zeros_like(path.left))
-                for b, c in zip(given, chosen, strict=True)
-            )
+            given = tuple(b + hit.bounce * (c & ~hit.rests).astype(path.left.dtype) for b, c in zip(given, chosen, strict=True))
+        # Exactly on the plane, where rounding would leave it a little below. The derivative is that of the path: its height stays zero.
+        position = path.position
+        for plane, base, c in zip(self.planes, self.base, chosen, strict=True):
+            position = position + jnp.where(c, base - plane.height(position), jnp.zeros_like(base)) * hit.lever
         held = self._held(path, hit, chosen)
         velocity = path.velocity.map(lambda w, j: jnp.where(hit.rests, w, w + j), hit.bounce)
         struck = jnp.ones_like(path.is_struck)
-        after = Path(path.position, velocity, path.left, held, struck, first, moments, work, given)
+        after = Path(position, velocity, path.left, held, struck, first, moments, work, given)
         return self._hopped(after, hit, chosen, is_hit, path.held)
 
     def _held(self, path: Path, hit: _Hit, chosen: tuple[Array, ...]) -> tuple[Array, ...]:

@@ -12,14 +12,17 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array
 
 from .._checks import as_inexact, has_shape, is_concrete, nonnegative, plane
+from ..numerics import any_lane
 from ..state import State
 from ..status import Flag, Status
 from ..vector import Vector
 from .base import Rule, Step, any_refused
-from .impacts import Impacts, Path, Plane, pick, without
+from .impacts import Impacts, Path
+from .planes import Plane, pick, without
 
 
 class Floor(Rule):
@@ -106,24 +109,33 @@ def strike(floors: tuple[Rule, ...], step: Step, state: State, books: bool = Fal
     moved = step.moved
     planes, order = _ordered(tuple(f.plane(moved) for f in floors if isinstance(f, Floor)))
     scene, path = _begun(planes, step, books)
-    path, unfinished = scene.follow(path)
-    end, velocity = scene.end(path)
-    position, velocity = _where(path.is_struck, end.position, moved.position), _where(path.is_struck, velocity, moved.velocity)
-    if step.by_velocity is not None:
+
+    def met(path: Path) -> tuple[Vector, Vector, Any, Array]:
+        path, unfinished = scene.follow(path)
+        end, velocity = scene.end(path)
+        position, velocity = _where(path.is_struck, end.position, moved.position), _where(path.is_struck, velocity, moved.velocity)
         position, velocity = _damped(scene, path, end.held, step, position, velocity)
+        return position, velocity, (end.work, end.given), unfinished
+
+    def passed(path: Path) -> tuple[Vector, Vector, Any, Array]:
+        return moved.position, moved.velocity, (path.work, path.given), jnp.zeros_like(path.is_struck)
+
+    # Most steps of most scenes hold no impact: they pay for looking alone.
+    any_meets = any_lane(jnp.any(scene.next_impact(path)[2]))
+    position, velocity, (work, given), unfinished = lax.cond(any_meets, met, passed, path)
     # Another rule may have moved or kicked nodes since: then what the impacts change is added to that.
     if state.position is not moved.position:
         position = state.position + (position - moved.position)
     if state.velocity is not moved.velocity:
         velocity = state.velocity + (velocity - moved.velocity)
-    after = state.moved(position, velocity)
     status = Status.when(Flag.INVALID, step.dt < 0)
     if len(planes) > 1:
         node = jnp.argmax(jnp.ravel(unfinished)).astype(jnp.int32)
         status = status.then(Status.when(Flag.IMPACTS, jnp.any(unfinished), node=node, count=jnp.sum(unfinished)))
-    if end.work is None or end.given is None:
+    after = state.moved(position, velocity)
+    if work is None or given is None:
         return after, status, None
-    return after, status, (tuple(pick(c, end.work) for c in order), tuple(_pick_vector(c, end.given) for c in order))
+    return after, status, (tuple(pick(c, work) for c in order), tuple(_pick_vector(c, given) for c in order))
 
 
 def _begun(planes: tuple[Plane, ...], step: Step, books: bool) -> tuple[Impacts, Path]:
@@ -131,10 +143,13 @@ def _begun(planes: tuple[Plane, ...], step: Step, books: bool) -> tuple[Impacts,
     before, moved = step.before, step.moved
     goes = step.dt > 0
     dt = jnp.where(goes, step.dt, jnp.ones_like(step.dt))
-    a = (moved.velocity - before.velocity) / dt
-    u = (moved.position - before.position) / dt - (0.5 * dt) * a
+    per_dt = 1 / dt  # one division for all nodes
+    a = per_dt * (moved.velocity - before.velocity)
+    u = per_dt * (moved.position - before.position) - (0.5 * dt) * a
     free = step.free if step.free is not None else (None,) * moved.dim
-    scene = Impacts(planes, free, tuple(_base(p, before.position) for p in planes), a, moved.velocity - (u + dt * a))
+    rounding = tuple(p.rounding(before.position) for p in planes)
+    base = tuple(_base(p, before.position, least) for p, least in zip(planes, rounding, strict=True))
+    scene = Impacts(planes, free, base, rounding, dt, a, moved.velocity - (u + dt * a))
     left = jnp.broadcast_to(jnp.where(goes, step.dt, jnp.zeros_like(step.dt)), moved.position.shape)
     nothing, none = jnp.zeros_like(left), Vector.zeros_like(u)
     asks = step.by_velocity is not None
@@ -152,10 +167,10 @@ def _begun(planes: tuple[Plane, ...], step: Step, books: bool) -> tuple[Impacts,
     return scene, path
 
 
-def _base(plane: Plane, position: Vector) -> Array:
+def _base(plane: Plane, position: Vector, rounding: Array) -> Array:
     """Where a node counts from [m]: the plane, or its own place below it. What is below by rounding only is on the plane."""
     height = plane.height(position)
-    return jnp.where(height < -plane.rounding(position), height, jnp.zeros_like(height))
+    return jnp.where(height < -rounding, height, jnp.zeros_like(height))
 
 
 def _ordered(planes: tuple[Plane, ...]) -> tuple[tuple[Plane, ...], tuple[tuple[Array, ...], ...]]:

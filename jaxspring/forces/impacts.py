@@ -38,34 +38,9 @@ from jaxtyping import Array
 
 from ..numerics import any_lane, tiny
 from ..vector import Vector
+from .planes import Plane, braked, meeting, pick, without
 
-MOST = 8  # impacts (with a pair of planes) followed in one step
-ROUNDING = 16  # of the terms of a height, in units of the last place
-
-
-class Plane(eqx.Module):
-    """A plane as an impact sees it.
-
-    Attributes:
-        point: D numbers [m], 0-d arrays.
-        normal: D numbers, of length one.
-        friction: mu.
-        restitution: e.
-    """
-
-    point: Vector
-    normal: Vector
-    friction: Array
-    restitution: Array
-
-    def height(self, position: Vector) -> Array:
-        """(x - p) . n [m]."""
-        return (position - self.point).dot(self.normal)
-
-    def rounding(self, position: Vector) -> Array:
-        """Below which a height is rounding [m]."""
-        size = position.map(jnp.abs) + self.point.map(jnp.abs)
-        return ROUNDING * float(jnp.finfo(position.dtype).eps) * size.dot(self.normal.map(jnp.abs))
+MOST = 16  # impacts (with a pair of planes) followed in one step
 
 
 class Path(eqx.Module):
@@ -106,7 +81,6 @@ class _Hit(eqx.Module):
         bounce: J [m/s].
         stop: what rest takes of the velocity [m/s].
         pressed: n . a, toward the plane where negative [m/s^2].
-        flight: time of the next flight [s]; 0 where nothing pulls back.
         rests: whether the node stays on the plane.
     """
 
@@ -118,7 +92,6 @@ class _Hit(eqx.Module):
     bounce: Vector
     stop: Vector
     pressed: Array
-    flight: Array
     rests: Array
 
 
@@ -129,6 +102,8 @@ class Impacts(eqx.Module):
         planes: in a fixed order.
         free: per coordinate, where nodes are free (None: all are).
         base: per plane, the height from which a node counts [m]: 0, or where it began below the plane.
+        rounding: per plane, below which a height is rounding [m].
+        dt: of the whole step [s].
         acceleration: a, in node shape [m/s^2].
         offset: what the stepper's velocity differs by from the parabola's [m/s].
     """
@@ -136,13 +111,15 @@ class Impacts(eqx.Module):
     planes: tuple[Plane, ...]
     free: tuple[Array | None, ...]
     base: tuple[Array, ...]
+    rounding: tuple[Array, ...]
+    dt: Array
     acceleration: Vector
     offset: Vector
 
     def follow(self, path: Path) -> tuple[Path, Array]:
         """Through all impacts of the step, and which nodes would have gone on beyond `MOST`."""
         if len(self.planes) == 1:
-            return self.strike(path)[0], jnp.zeros((), bool)
+            return self.strike(path)[0], jnp.zeros_like(path.is_struck)
 
         def sweep(carry: tuple[Path, Array], _: None) -> tuple[tuple[Path, Array], None]:
             path, goes_on = carry
@@ -168,9 +145,11 @@ class Impacts(eqx.Module):
         chosen: list[Array] = []
         for i, plane in enumerate(self.planes):
             height = plane.height(path.position) - self.base[i]
-            # What is below the plane here is rounding: its value is dropped, its derivative is kept.
-            height = height - lax.stop_gradient(jnp.minimum(height, jnp.zeros_like(height)))
-            t, meets = _meeting(height, u.dot(plane.normal), a.dot(plane.normal), path.left)
+            # What is rounding counts as on the plane: its value is dropped, its derivative is kept.
+            is_on = height <= self.rounding[i]
+            height = height - lax.stop_gradient(jnp.where(is_on, height, jnp.zeros_like(height)))
+            v, b = u.dot(plane.normal), a.dot(plane.normal)
+            t, meets = meeting(height, v, b, path.left, is_on & self.is_still(v, b, i))
             if any(mask is not None for mask in self.free):
                 meets = meets & (self.free_part(plane.normal, height).norm() > 0)
             if path.held:
@@ -179,6 +158,11 @@ class Impacts(eqx.Module):
             best, is_hit = jnp.where(is_earlier, t, best), is_hit | meets
             chosen = [*(c & ~is_earlier for c in chosen), is_earlier]
         return best, tuple(chosen), is_hit
+
+    def is_still(self, into: Array, pressed: Array, plane: int) -> Array:
+        """Whether a speed along a normal is rounding of places, or nothing beside what the acceleration makes of it in the step."""
+        part = float(jnp.finfo(into.dtype).eps) ** 0.5
+        return jnp.abs(into) * self.dt <= self.rounding[plane] + part * jnp.abs(pressed) * self.dt * self.dt
 
     def free_part(self, v: Vector, like: Array) -> Vector:
         """`v` where free, zero where held; in node shape where a coordinate is held anywhere."""
@@ -192,6 +176,8 @@ class Impacts(eqx.Module):
     def basis(self, held: tuple[Array, ...]) -> tuple[Vector, ...]:
         """Directions of length one that the planes take from nodes that rest on them, at right angles to each other; elsewhere zero."""
         found: list[Vector] = []
+        if held and len(self.planes) == 1 and all(mask is None for mask in self.free):
+            return (self.planes[0].normal * held[0].astype(self.base[0].dtype),)
         for plane, is_held in zip(self.planes, held, strict=bool(held)):
             n = self.free_part(plane.normal, self.base[0])
             for e in found:
@@ -213,7 +199,7 @@ class Impacts(eqx.Module):
         pulls = [plane.friction * j for plane, j in zip(self.planes, pressed, strict=True)]
         pull = sum(pulls[1:], start=pulls[0])
         along, slip, begun = without(free, basis), without(off, basis), without(w, basis)
-        share = _share(pull, along)
+        share = braked(pull, along)
         # A constant force of friction over the time t; one that stops the node also ends what the stepper's offset moves it.
         slid = begun + (0.5 * t) * without(a, basis) - (0.5 * share) * along + share * slip
         velocity = (1 - share) * along
@@ -263,12 +249,14 @@ class Impacts(eqx.Module):
         into, zero = w.dot(normal), jnp.zeros_like(path.left)
         out = -e * into
         slip = true - true.dot(normal) * lever
-        bounce = (out - into) * lever - _share(mu * (1 + e) * length * jnp.maximum(-into, zero), slip) * slip
+        bounce = (out - into) * lever - braked(mu * (1 + e) * length * jnp.maximum(-into, zero), slip) * slip
         pressed = without(self.acceleration, self.basis(path.held)).dot(normal)
         falls = is_hit & (pressed < 0)
-        flight = jnp.where(falls, 2 * out / jnp.where(falls, -pressed, jnp.ones_like(pressed)), zero)
-        fits = (flight <= path.left * (1 - e)) | (out <= jnp.abs(self.offset.dot(normal)))
-        return _Hit(normal, lever, e, mu * length, out, bounce, -true.dot(normal) * lever, pressed, flight, falls & (e < 1) & fits)
+        # The next flight lasts 2 out / -pressed.
+        fits = (e < 1) & ((2 * out <= -pressed * path.left * (1 - e)) | (out <= jnp.abs(self.offset.dot(normal))))
+        for i, c in enumerate(chosen):
+            fits = fits | (c & self.is_still(into, pressed, i))
+        return _Hit(normal, lever, e, mu * length, out, bounce, -true.dot(normal) * lever, pressed, falls & fits)
 
     def _thrown(self, path: Path, chosen: tuple[Array, ...], is_hit: Array) -> Path:
         """The path after the impact that it has come to."""
@@ -305,13 +293,18 @@ class Impacts(eqx.Module):
 
     def _hopped(self, path: Path, hit: _Hit, chosen: tuple[Array, ...], is_hit: Array, held: tuple[Array, ...]) -> Path:
         """After all further bounces on the same plane that fit into the time left, where no other plane is in their way."""
-        more = is_hit & ~hit.rests & (hit.pressed < 0) & (hit.flight < path.left)
+        more = is_hit & ~hit.rests & (hit.pressed < 0) & (2 * hit.out < -hit.pressed * path.left)
         for was in held:
             more = more & ~was
+        # Rare: what it takes, a logarithm per node, is left out of other steps.
+        return lax.cond(any_lane(jnp.any(more)), lambda p: self._hops(p, hit, chosen, more), lambda p: p, path)
+
+    def _hops(self, path: Path, hit: _Hit, chosen: tuple[Array, ...], more: Array) -> Path:
+        """The bounces of `_hopped`, of the nodes that have more of them."""
         e, left, one, zero = hit.restitution, path.left, jnp.ones_like(path.left), jnp.zeros_like(path.left)
         decays = e < 1
         ratio = jnp.where(decays, e, jnp.full_like(e, 0.5))
-        flight = jnp.where(more, hit.flight, one)
+        flight = jnp.where(more, 2 * hit.out / jnp.where(more, -hit.pressed, one), one)
         log = jnp.log(jnp.maximum(e, tiny(left.dtype)))
         # The last bounce but rounding: which side of it is left to rounding makes no difference to where the node is.
         by_ratio = jnp.log1p(-jnp.where(more & decays, left * (1 - ratio) / flight, zero)) / jnp.where(log < 0, log, jnp.full_like(log, -1))
@@ -323,7 +316,7 @@ class Impacts(eqx.Module):
         along = w + total * (self.acceleration - hit.pressed * hit.lever)
         slip = along + self.offset - self.offset.dot(hit.normal) * hit.lever
         impulse = jnp.where(more, (1 + e) * hit.out * spread, zero)
-        share = _share(hit.friction * impulse, slip)
+        share = braked(hit.friction * impulse, slip)
         position = path.position + (0.5 * total) * (w + along - share * slip)
         velocity = along - share * slip + (hit.out * power) * hit.lever
         work, given = path.work, path.given
@@ -342,41 +335,4 @@ class Impacts(eqx.Module):
         return jax.tree.map(lambda new, old: jnp.where(clear, new, old), after, path)
 
 
-def _meeting(s: Array, u: Array, a: Array, left: Array) -> tuple[Array, Array]:
-    """First time in which s + u t + a t^2 / 2 comes down through 0 [s], and whether it does within `left`; 0 where it does not."""
-    sinks = (s + left * (u + 0.5 * left * a) < 0) & ((u <= 0) | (a < 0))
-    square = u * u - 2 * a * s
-    dips = (a > 0) & (u < 0) & (u + a * left > 0) & (square > 0)
-    meets = sinks | dips
-    one, zero = jnp.ones_like(s), jnp.zeros_like(s)
-    # Chosen before the root and the quotients, so that their derivatives are finite everywhere.
-    is_real = meets & (square > 0)
-    root = jnp.where(is_real, jnp.sqrt(jnp.where(is_real, square, one)), zero)
-    comes, falls = meets & (u <= 0) & (root - u > 0), meets & (u > 0)
-    t = jnp.where(comes, 2 * s / jnp.where(comes, root - u, one), zero)
-    return jnp.where(falls, (u + root) / jnp.where(falls, -a, one), t), meets
-
-
-def without(v: Vector, basis: tuple[Vector, ...]) -> Vector:
-    """`v` without its parts along these directions of length one (or zero)."""
-    for e in basis:
-        v = v - v.dot(e) * e
-    return v
-
-
-def _share(pull: Array, along: Vector) -> Array:
-    """Which part of a tangential velocity friction takes that could take `pull` of it [m/s]; 0 where there is none."""
-    speed = along.norm()
-    is_sliding, one = speed > 0, jnp.ones_like(speed)
-    return jnp.where(is_sliding, jnp.minimum(pull / jnp.where(is_sliding, speed, one), one), jnp.zeros_like(speed))
-
-
-def pick(chosen: tuple[Array, ...], values: tuple[Array, ...]) -> Array:
-    """The value of the chosen plane; one plane's alone is no choice."""
-    found = values[0]
-    for c, value in zip(chosen[1:], values[1:], strict=True):
-        found = jnp.where(c, value, found)
-    return found
-
-
-__all__ = ["MOST", "Impacts", "Path", "Plane", "pick", "without"]
+__all__ = ["MOST", "Impacts", "Path"]

@@ -77,7 +77,7 @@ def test_l1_symplectic_euler_is_of_order_one():
     error = []
     for n_steps in (250, 2000):
         values, slopes = jax.jit(jax.vmap(jax.value_and_grad(lambda p, n=n_steps: height(p, js.SymplecticEuler(), n))))(inputs)
-        right = [exact(*p).real for p in inputs], [exact_derivatives(p) for p in inputs]
+        right = np.array([exact(*p).real for p in inputs]), np.array([exact_derivatives(p) for p in inputs])
         error.append((np.abs(values - right[0]), np.abs(slopes - right[1]).max(axis=1)))
     for coarse, fine in zip(*error, strict=True):
         assert np.all(coarse / fine > 4)

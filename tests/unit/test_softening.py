@@ -183,13 +183,17 @@ def test_fusing_beside_springs_of_other_nets():
     js.System(BARE, 1.0, js.Drag(1.0), rules=js.Fusing(BARE, 350.0)).prepare(float)
 
 
+# Compiled: one operation at a time it takes seconds.
+after_floor = eqx.filter_jit(lambda floor, step, state: floor.update(step, state))
+
+
 def on_floor(velocity, friction=0.0, restitution=0.0, height=0.1):
     """One node that flew with this velocity for 0.1 s and would end 0.1 m below the floor, or begins at this height; after the floor."""
     net = js.lattice(1)
     floor = js.Floor((0.0, 0.0), (0.0, 1.0), friction, restitution)
     before = js.State.from_points(net, [[0.0, height]], [velocity])
     moved = before.moved(before.position + 0.1 * before.velocity, before.velocity)
-    return floor.update(Step(before, moved, jnp.asarray(0.1)), moved)[0]
+    return after_floor(floor, Step(before, moved, jnp.asarray(0.1)), moved)[0]
 
 
 def test_floor():
@@ -221,7 +225,7 @@ def test_floor_anywhere(rng):
     x, v = p + rng.normal(size=(6, 3)) * 0.1 + 0.5 * unit, 10 * rng.normal(size=(6, 3))
     before = js.State.from_points(net, x, v)
     moved = before.moved(before.position + 0.1 * before.velocity, before.velocity)
-    end, status = js.Floor(p, n).update(Step(before, moved, jnp.asarray(0.1)), moved)
+    end, status = after_floor(js.Floor(p, n), Step(before, moved, jnp.asarray(0.1)), moved)
     flown = x + 0.1 * v
     height = (flown - p) @ unit
     assert 0 < (height < 0).sum() < 6
@@ -233,5 +237,5 @@ def test_floor_anywhere(rng):
 def test_a_floor_does_not_run_backward():
     """What a floor took is gone: a step back in time is INVALID."""
     state = js.State.from_points(CHAIN, CHAIN.grid())
-    status = js.Floor((0.0,), (1.0,)).update(Step(state, state, jnp.asarray(-0.1)), state)[1]
+    status = after_floor(js.Floor((0.0,), (1.0,)), Step(state, state, jnp.asarray(-0.1)), state)[1]
     assert bool(status.has(js.Flag.INVALID))

@@ -149,6 +149,85 @@ def test_l1_with_drag():
     assert slope[0] == pytest.approx(DRAG, abs=2e-3)
 
 
+class AirDrag(js.Force):
+    """-c |v| v: a force of one's own that names no damping."""
+
+    coefficient: jax.Array
+
+    def force(self, state):
+        return -self.coefficient * state.velocity.norm() * state.velocity
+
+
+@pytest.mark.slow
+def test_l1_with_a_drag_of_ones_own():
+    """L1: with quadratic drag and no weight, height and derivatives by h0, |v0|, e and c against the closed form, of order one in dt."""
+    duration = 0.7
+
+    def end(p, n_steps):
+        h, v, e, c = p
+        start = js.State.from_points(NET, jnp.stack([h, h + 9])[:, None], jnp.stack([-v, -v])[:, None])
+        system = js.System(NET, 1.0, AirDrag(c), rules=js.Floor((0.0,), (1.0,), restitution=e))
+        return js.rollout(system, start, js.VelocityVerlet(), duration / n_steps, n_steps).state.position.x[0]
+
+    def right(p):
+        h, v, e, c = p
+        return jnp.log(1 + c * e * v * jnp.exp(-c * h) * (duration - (jnp.exp(c * h) - 1) / (c * v))) / c
+
+    p = tuple(map(jnp.asarray, (0.5, 3.0, 0.8, 0.9)))
+    value, slope = jax.jit(jax.value_and_grad(lambda p: end(p, 700)))(p)
+    np.testing.assert_allclose(value, right(p), atol=1e-5)
+    np.testing.assert_allclose(slope, jax.grad(right)(p), atol=3e-3)
+
+
+@pytest.mark.slow
+def test_l1_two_joined_by_a_dashpot():
+    """L1: the impact of one of two nodes that a dashpot joins changes the force on both: places and derivatives against closed forms."""
+    pair, duration, c, e = js.lattice(2), 1.0, 0.9, 0.7
+
+    def end(p, n_steps):
+        start = js.State.from_points(pair, jnp.stack([p[0], p[1]])[:, None], jnp.stack([p[2], p[3]])[:, None])
+        system = js.System(pair, 1.0, js.Dashpots(pair, c), rules=js.Floor((0.0,), (1.0,), restitution=e))
+        return js.rollout(system, start, js.VelocityVerlet(), duration / n_steps, n_steps).state.position.x
+
+    def flown(x, v, t):
+        mean, half = (v[0] + v[1]) / 2, (v[0] - v[1]) / 2
+        decay = np.exp(-2 * c * t)
+        way = half * (1 - decay) / (2 * c)
+        return (x[0] + mean * t + way, x[1] + mean * t - way), (mean + half * decay, mean - half * decay)
+
+    def right(p):
+        t = 0.3
+        for _ in range(30):
+            x, v = flown(p[:2], p[2:], t)
+            t = t - x[0] / v[0]
+        x, v = flown(p[:2], p[2:], t)
+        return np.array(flown((0.0 * t, x[1]), (-e * v[0], v[1]), duration - t)[0])
+
+    p = np.array([0.6, 1.5, -2.0, -0.5])
+    derivatives = np.stack([right(p + 1e-30j * np.eye(4)[i]).imag / 1e-30 for i in range(4)], axis=1)
+    error = []
+    for n_steps in (100, 800):
+        f = jax.jit(lambda p, n=n_steps: (end(p, n), jax.jacfwd(lambda p: end(p, n))(p)))
+        value, slopes = f(jnp.asarray(p))
+        error.append((np.abs(value - right(p)).max(), np.abs(slopes - derivatives).max()))
+    assert error[1][0] < 1e-5
+    assert error[1][1] < 3e-3
+    assert error[0][1] / error[1][1] > 4
+
+
+@pytest.mark.slow
+def test_a_floor_that_is_far_changes_no_bit():
+    """Where nothing meets a floor, the states are those without it, to the last bit, with Verlet and damping too."""
+    net = js.lattice(5)
+    forces = (js.Springs(net, 30.0, 0.9), js.Dashpots(net, 0.5), AirDrag(jnp.asarray(0.1)), js.Gravity((0.3, -9.81)))
+    start = js.State.from_points(net, np.c_[np.arange(5.0), np.zeros(5)], np.eye(5, 2))
+    ends = [
+        js.rollout(js.System(net, 1.0, forces, rules=rules), start, js.VelocityVerlet(), 0.01, 50).state.points
+        for rules in ((), js.Floor((0.0, -50.0), UP))
+    ]
+    np.testing.assert_array_equal(*ends)
+
+
 def thrown(normals, order, n_steps=60, restitution=0.8, gravity=9.81, dt=0.02, velocity=None):
     """Places and velocities of 40 nodes thrown about between planes through the origin, given in this order; and the run."""
     normals = np.asarray(normals)

@@ -292,7 +292,11 @@ def _advance(system: System, stepper: Stepper, clock: _Clock, carry: Carry) -> C
     state = state if system.motion is None else system.constrain(state)
     if carry.found is None:
         return Carry(state, memory, index, solves)
-    state, status = system.follow(carry.state, state, dt)
+    moved = state
+    state, status = system.follow(carry.state, moved, dt)
+    # Known from the program alone: a rule that leaves the nodes as they are hands on the same arrays.
+    if state.position is not moved.position or state.velocity is not moved.velocity:
+        memory = stepper.after_rules(system, carry.state, moved, state, dt, memory)
     status = stopped(eqx.tree_at(lambda s: s.step, status, jnp.where(status.flags != 0, index, status.step)))
     return Carry(state, memory, index, solves, carry.found.then(status))
 

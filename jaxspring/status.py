@@ -41,9 +41,10 @@ class Flag(enum.IntFlag):
     SOLVER = 65536
     UNSTABLE = 131072
     UNDETERMINED = 262144
+    IMPACTS = 524288
 
 
-WARNINGS = Flag.COINCIDENT | Flag.OVERLAP | Flag.OUTSIDE | Flag.DT_LIMIT | Flag.PRECISION | Flag.UNDETERMINED
+WARNINGS = Flag.COINCIDENT | Flag.OVERLAP | Flag.OUTSIDE | Flag.DT_LIMIT | Flag.PRECISION | Flag.UNDETERMINED | Flag.IMPACTS
 
 EXPLANATION = {
     Flag.NONFINITE: "a position, velocity or temperature is NaN or infinite, or a spring so long that its square is; try a smaller dt "
@@ -65,6 +66,7 @@ EXPLANATION = {
     Flag.SOLVER: "the solver gave up: its solve did not reach the accuracy it needs, or its step shrank to the least allowed",
     Flag.UNSTABLE: "the forces balance, but the shape is no minimum of the energy: a small push makes it buckle; start from one",
     Flag.UNDETERMINED: "the data leave some of the parameters open; fix or tie them, or add data",
+    Flag.IMPACTS: "a node met more obstacles in one step than are followed, and waited at the last one; lower dt",
     Flag.INVALID: "a parameter has a value that its constructor would refuse (sign, NaN or infinity)",
 }
 

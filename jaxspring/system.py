@@ -19,7 +19,8 @@ from jaxtyping import Array
 
 from ._arrays import as_mask, kept
 from ._checks import as_inexact, finite, has_shape, positive, shape_of, triangle_indices
-from .forces.base import Force, Rule
+from .forces.base import Force, Rule, Step
+from .forces.contact import strike
 from .forces.linearisation import Linearisation
 from .linalg.operators import Blocks, SpringMatrix
 from .numerics import cast_inexact
@@ -104,6 +105,7 @@ class System(eqx.Module):
         self.forces = tuple(self._adopt(i, f) for i, f in enumerate(forces if isinstance(forces, Iterable) else (forces,)))
         # None, not an empty tuple, which some transformations of equinox and diffrax mistake for an array.
         self.rules = tuple(self._adopt_rule(i, r) for i, r in enumerate(rules if isinstance(rules, Iterable) else (rules,))) or None
+        _act_together(self.rules or ())
         self.free = _as_free(net, free)
         self.motion = motion
         if motion is not None:
@@ -192,13 +194,34 @@ class System(eqx.Module):
         return state
 
     def follow(self, before: State, state: State, dt: Array) -> tuple[State, Status]:
-        """What happens after a step besides motion, and what went wrong there."""
+        """What happens after a step besides motion, and what went wrong there: obstacles last, all of them together."""
         total = Status.ok()
+        step = self._step(before, state, dt)
+        last = tuple((i, rule) for i, rule in self.followers if rule.obstacles)
         for i, rule in self.followers:
-            state, status = rule.update(before, state, dt)
-            placed = jnp.where(status.flags != 0, jnp.asarray(i, jnp.int32), status.effect)
-            total = total.then(eqx.tree_at(lambda s: s.effect, status, placed))
+            if not rule.obstacles:
+                state, status = rule.update(step, state)
+                total = total.then(_placed(status, i))
+        if len(last) > 1:
+            state, status, _ = strike(tuple(rule for _, rule in last), step, state)
+            total = total.then(_placed(status, last[0][0]))
+        elif last:
+            state, status = last[0][1].update(step, state)
+            total = total.then(_placed(status, last[0][0]))
         return state, total
+
+    def _step(self, before: State, moved: State, dt: Array) -> Step:
+        """What the rules may know of a step; what only obstacles ask for is None where there are none."""
+        if not any(rule.obstacles for _, rule in self.followers):
+            return Step(before, moved, dt)
+        lagging = tuple(f for f in self.forces if _reads_velocity(self._cast(f, moved), moved))
+
+        def by_velocity(velocity: Vector) -> Vector:
+            at = moved.moved(moved.position, velocity)
+            forces = [self._cast(f, at).force(at) for f in lagging]
+            return self.hold(sum(forces[1:], start=forces[0]) * (1 / self.mass.astype(at.dtype)))
+
+        return Step(before, moved, dt, self.free_masks(moved.dim), by_velocity if lagging else None)
 
     def prepare(self, dtype: Any) -> System:
         """The system as a loop wants it: every constant in the shape of the topology and of `dtype`."""
@@ -307,6 +330,31 @@ class System(eqx.Module):
             return free
         still = ~self.motion.moved
         return tuple(still if m is None else m & still for m in free)
+
+
+def _act_together(rules: tuple[Rule, ...]) -> None:
+    """Raises ValueError where obstacles stand beside a rule that runs its own: they would act in two passes."""
+    last = [rule for rule in rules if rule.obstacles]
+    books = [type(rule).__name__ for rule in last if not any(obstacle is rule for obstacle in rule.obstacles)]
+    if len(last) > 1 and books:
+        raise ValueError(
+            f"rules hold {len(last)} obstacles or sets of them, one within {books[0]}. All obstacles act together, the earliest impact "
+            f"first: put all of them into the {books[0]}."
+        )
+
+
+def _placed(status: Status, effect: int) -> Status:
+    """The status naming this effect, where anything went wrong."""
+    placed = jnp.where(status.flags != 0, jnp.asarray(effect, jnp.int32), status.effect)
+    return eqx.tree_at(lambda s: s.effect, status, placed)
+
+
+def _reads_velocity(force: Force, state: State) -> bool:
+    """Whether the program of a force names the velocities at all."""
+    program = jax.make_jaxpr(lambda v: force.force(state.moved(state.position, v)))(state.velocity).jaxpr
+    inputs = {id(v) for v in program.invars}
+    read = [v for equation in program.eqns for v in equation.invars]
+    return any(id(v) in inputs for v in (*read, *program.outvars))
 
 
 def _sum_blocks(parts: Iterable[Blocks | None]) -> Blocks:

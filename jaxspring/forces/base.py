@@ -9,6 +9,7 @@ Write your own by subclassing `Force`: `force` alone is enough. `energy` closes 
 from __future__ import annotations
 
 import abc
+from collections.abc import Callable
 from typing import Any, Self
 
 import equinox as eqx
@@ -38,16 +39,36 @@ class Finding(eqx.Module):
     node: Array
 
 
+class Step(eqx.Module):
+    """The step that a rule follows.
+
+    Attributes:
+        before: the state in which it began.
+        moved: where motion took it, before any rule.
+        dt: [s].
+        free: per coordinate, where nodes are free (None: all are). None where no obstacle asks.
+        by_velocity: (velocities) -> accelerations [m/s^2] by the forces that depend on velocity, where motion ended; None where no force
+            does, or no obstacle asks.
+    """
+
+    before: State
+    moved: State
+    dt: Array
+    free: tuple[Array | None, ...] | None = None
+    by_velocity: Callable[[Vector], Vector] | None = None
+
+
 class Rule(eqx.Module):
     """What happens to a state after each step, besides motion. Abstract.
 
-    Rules run in the order in which the system names them, each on the state that the one before left.
+    Rules run in the order in which the system names them, each on the state that the one before left; obstacles come last, together. A
+    rule that gives the state another position or velocity tells the stepper so by that alone.
     """
 
     @property
-    def is_contact(self) -> bool:
-        """Whether its shifts of nodes only put back what the step has carried too far: a `Ledger` books them with the step."""
-        return False
+    def obstacles(self) -> tuple[Rule, ...]:
+        """The obstacles that it holds, itself where it is one. All of a system's act together, the earliest impact first."""
+        return ()
 
     @property
     def sets_temperature(self) -> bool:
@@ -58,8 +79,8 @@ class Rule(eqx.Module):
         """The state with the memory that this rule needs, made where it is not there yet. Called before the first step."""
         return state
 
-    def update(self, before: State, state: State, dt: Array) -> tuple[State, Status]:
-        """The state after a step of `dt` [s] that began at `before` and moved the nodes to `state`, and what went wrong."""
+    def update(self, step: Step, state: State) -> tuple[State, Status]:
+        """The state after this rule, where `state` is what motion and the rules before it left, and what went wrong."""
         return state, Status.ok()
 
     def limit(self, state: State) -> Array | None:

@@ -1,29 +1,35 @@
-"""A floor: what has sunk below a plane is put on it.
+"""A floor: a plane that nothing passes, with restitution and friction.
 
-    s = (x - p) . n < 0:    x' = x - s n                                              back on the plane
-                            j  = (1 + e) max(-v . n, 0)                               normal impulse over mass [m/s]
-                            v' = v + j n - min(mu j, |v_t|) v_t / |v_t|               Coulomb's friction on the tangential part v_t
+    at an impact, w the velocity there       J = -(1 + e)(n . w) n - min(mu j, |w_t|) w_t / |w_t|         j = -(1 + e) n . w
+    at rest on the plane                     v' = v - (n . v) n - min(mu j, |v_t|) v_t / |v_t|            j = -n . v
 
-Source: projection and friction as usual for particles; slide "Heating and Melting" has constraint surfaces.
+The step is split where a node meets a plane: see `impacts.py`, which holds the rule and its source.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array
 
 from .._checks import as_inexact, has_shape, is_concrete, nonnegative, plane
-from ..numerics import tiny
+from ..numerics import any_lane
 from ..state import State
 from ..status import Flag, Status
 from ..vector import Vector
-from .base import Rule, any_refused
+from .base import Rule, Step, any_refused
+from .impacts import Impacts, Path
+from .planes import Plane, pick, without
 
 
 class Floor(Rule):
-    """A plane that nothing passes. Belongs to a system's `rules`, last. Held nodes below it are lifted too: place them above.
+    """A plane that nothing passes. Belongs to a system's `rules`; all floors act together, after the other rules.
+
+    A node that begins a step below the plane counts from where it is: it goes no deeper, and is not lifted. Held nodes and held
+    coordinates stay.
 
     Attributes:
         point: (D,) a point of the plane [m].
@@ -57,39 +63,162 @@ class Floor(Rule):
             raise ValueError(f"restitution = {self.restitution} throws nodes back faster than they came. Pass 0 to 1.")
 
     @property
-    def is_contact(self) -> bool:
-        """Yes: a node is put back where the step began to carry it too far."""
-        return True
+    def obstacles(self) -> tuple[Rule, ...]:
+        """Itself."""
+        return (self,)
 
     def height(self, state: State) -> Array:
         """(x - p) . n of each node [m], in node shape."""
-        if self.point.shape[0] != state.dim:
-            raise ValueError(f"the floor has {self.point.shape[0]} coordinates, the positions have {state.dim}.")
-        parts = [n * (x - p) for x, p, n in zip(state.position, self._of(self.point, state), self._of(self.normal, state), strict=True)]
-        return sum(parts[1:], start=parts[0])
+        return self.plane(state).height(state.position)
 
-    def update(self, before: State, state: State, dt: Array) -> tuple[State, Status]:
-        """Nodes below the plane put on it, without inward speed."""
-        s, n, v = self.height(state), self._of(self.normal, state), state.velocity
-        zero = jnp.zeros((), s.dtype)
-        lift = jnp.maximum(-s, zero)
-        inward = -sum((b * a for b, a in zip(n[1:], v.components[1:], strict=True)), start=n[0] * v[0])
-        stop = jnp.where(s < 0, jnp.maximum(inward, zero), zero)
-        impulse = (1 + self.restitution.astype(s.dtype)) * stop
-        along = [a + b * inward for a, b in zip(v, n, strict=True)]
-        squared = sum((a * a for a in along[1:]), start=along[0] * along[0])
-        is_sliding = squared > tiny(s.dtype)
-        speed = jnp.sqrt(jnp.where(is_sliding, squared, jnp.ones_like(squared)))
-        brake = jnp.where(is_sliding, jnp.minimum(self.friction.astype(s.dtype) * impulse / speed, jnp.ones_like(s)), zero)
-        moved = v.map(lambda a, t, b: a + b * impulse - brake * t, Vector(tuple(along)), Vector(n))
-        return state.moved(state.position.map(lambda x, b: x + b * lift, Vector(n)), moved), Status.when(Flag.INVALID, dt < 0)
+    def update(self, step: Step, state: State) -> tuple[State, Status]:
+        """The state after all impacts of the step on this plane."""
+        state, status, _ = strike((self,), step, state)
+        return state, status
 
     def invalid(self) -> Array:
         """Whether a coefficient is one that the constructor refuses."""
         return any_refused(self.friction, self.restitution) | (self.restitution > 1)
 
-    def _of(self, vector: Array, state: State) -> tuple[Array, ...]:
-        return tuple(vector.astype(state.dtype))
+    def plane(self, state: State) -> Plane:
+        """The plane in the dtype of the state.
+
+        Raises:
+            ValueError: another number of coordinates than the state's.
+        """
+        if self.point.shape[0] != state.dim:
+            raise ValueError(f"the floor has {self.point.shape[0]} coordinates, the positions have {state.dim}.")
+        point, normal = (Vector(tuple(a.astype(state.dtype))) for a in (self.point, self.normal))
+        return Plane(point, normal, self.friction.astype(state.dtype), self.restitution.astype(state.dtype))
 
 
-__all__ = ["Floor"]
+Books = tuple[tuple[Array, ...], tuple[Vector, ...]]
+
+
+def strike(floors: tuple[Rule, ...], step: Step, state: State, books: bool = False) -> tuple[State, Status, Books | None]:
+    """The state after the impacts of a step on all these floors, whatever their order, and what went wrong.
+
+    With `books` also what each floor changed v^2 / 2 and v by, per node: node arrays and `Vector`s.
+
+    Raises:
+        TypeError: an obstacle that is no `Floor`.
+    """
+    others = [type(f).__name__ for f in floors if not isinstance(f, Floor)]
+    if others:
+        raise TypeError(f"{others[0]} counts as an obstacle, but only Floor can be one.")
+    moved = step.moved
+    planes, order = _ordered(tuple(f.plane(moved) for f in floors if isinstance(f, Floor)))
+    scene, path = _begun(planes, step, books)
+
+    def met(path: Path) -> tuple[Vector, Vector, Any, Array]:
+        path, unfinished = scene.follow(path)
+        end, velocity = scene.end(path)
+        position, velocity = _where(path.is_struck, end.position, moved.position), _where(path.is_struck, velocity, moved.velocity)
+        position, velocity = _damped(scene, path, end.held, step, position, velocity)
+        return position, velocity, (end.work, end.given), unfinished
+
+    def passed(path: Path) -> tuple[Vector, Vector, Any, Array]:
+        return moved.position, moved.velocity, (path.work, path.given), jnp.zeros_like(path.is_struck)
+
+    # Most steps of most scenes hold no impact: they pay for looking alone.
+    any_meets = any_lane(jnp.any(scene.next_impact(path)[2]))
+    position, velocity, (work, given), unfinished = lax.cond(any_meets, met, passed, path)
+    # Another rule may have moved or kicked nodes since: then what the impacts change is added to that.
+    if state.position is not moved.position:
+        position = state.position + (position - moved.position)
+    if state.velocity is not moved.velocity:
+        velocity = state.velocity + (velocity - moved.velocity)
+    status = Status.when(Flag.INVALID, step.dt < 0)
+    if len(planes) > 1:
+        node = jnp.argmax(jnp.ravel(unfinished)).astype(jnp.int32)
+        status = status.then(Status.when(Flag.IMPACTS, jnp.any(unfinished), node=node, count=jnp.sum(unfinished)))
+    after = state.moved(position, velocity)
+    if work is None or given is None:
+        return after, status, None
+    return after, status, (tuple(pick(c, work) for c in order), tuple(_pick_vector(c, given) for c in order))
+
+
+def _begun(planes: tuple[Plane, ...], step: Step, books: bool) -> tuple[Impacts, Path]:
+    """The step as a parabola, and every node at its beginning. With dt <= 0 no time is left, in which nothing is met."""
+    before, moved = step.before, step.moved
+    goes = step.dt > 0
+    dt = jnp.where(goes, step.dt, jnp.ones_like(step.dt))
+    per_dt = 1 / dt  # one division for all nodes
+    a = per_dt * (moved.velocity - before.velocity)
+    u = per_dt * (moved.position - before.position) - (0.5 * dt) * a
+    free = step.free if step.free is not None else (None,) * moved.dim
+    rounding = tuple(p.rounding(before.position) for p in planes)
+    base = tuple(_base(p, before.position, least) for p, least in zip(planes, rounding, strict=True))
+    scene = Impacts(planes, free, base, rounding, dt, a, moved.velocity - (u + dt * a))
+    left = jnp.broadcast_to(jnp.where(goes, step.dt, jnp.zeros_like(step.dt)), moved.position.shape)
+    nothing, none = jnp.zeros_like(left), Vector.zeros_like(u)
+    asks = step.by_velocity is not None
+    path = Path(
+        position=before.position,
+        velocity=u,
+        left=left,
+        held=(),
+        is_struck=jnp.zeros_like(left, bool),
+        first=(none, none, nothing) if asks else None,
+        moments=(none, none) if asks else None,
+        work=(nothing,) * len(planes) if books else None,
+        given=(none,) * len(planes) if books else None,
+    )
+    return scene, path
+
+
+def _base(plane: Plane, position: Vector, rounding: Array) -> Array:
+    """Where a node counts from [m]: the plane, or its own place below it. What is below by rounding only is on the plane."""
+    height = plane.height(position)
+    return jnp.where(height < -rounding, height, jnp.zeros_like(height))
+
+
+def _ordered(planes: tuple[Plane, ...]) -> tuple[tuple[Plane, ...], tuple[tuple[Array, ...], ...]]:
+    """The planes in an order that is theirs alone, and for each that was given the place in it, as one truth value per place.
+
+    Which of two impacts at the same time comes first, and every rounding, is then the same in whatever order they were given.
+    """
+    if len(planes) == 1:
+        return planes, ((jnp.ones((), bool),),)
+    keys = [(*p.normal, *p.point, p.restitution, p.friction) for p in planes]
+    places = [sum(_goes_first(k, key, i < j).astype(jnp.int32) for i, k in enumerate(keys) if i != j) for j, key in enumerate(keys)]
+    is_at = [tuple(place == i for place in places) for i in range(len(planes))]
+    ordered = tuple(jax.tree.map(lambda *values, c=chosen: pick(c, values), *planes) for chosen in is_at)
+    return ordered, tuple(zip(*is_at, strict=True))
+
+
+def _goes_first(a: tuple[Array, ...], b: tuple[Array, ...], otherwise: bool) -> Array:
+    """Whether the first number that differs is smaller in `a`; `otherwise` where none does."""
+    first, same = jnp.zeros((), bool), jnp.ones((), bool)
+    for x, y in zip(a, b, strict=True):
+        first, same = first | (same & (x < y)), same & (x == y)
+    return first | (same & otherwise)
+
+
+def _damped(scene: Impacts, path: Path, held: tuple[Array, ...], step: Step, position: Vector, velocity: Vector) -> tuple[Vector, Vector]:
+    """Positions and velocities with what forces that depend on velocity do otherwise after the impacts.
+
+    A change of velocity J with a time r left gives the accelerations F(v + J) - F(v), over mass, for that time: exactly where they are
+    linear, whose parts add up; what is beyond that counts for the node itself.
+    """
+    if path.first is None or path.moments is None or step.by_velocity is None:
+        return position, velocity
+    then, impulse, left = path.first
+    at = _where(path.is_struck, then, step.moved.velocity)
+    force, linear = jax.linearize(step.by_velocity, at)
+    bend = step.by_velocity(at + impulse) - force - linear(impulse)
+    basis = scene.basis(held)
+    position = position + without(linear(path.moments[1]) + (0.5 * left * left) * bend, basis)
+    velocity = velocity + without(linear(path.moments[0]) + left * bend, basis)
+    return scene.lifted(position), velocity
+
+
+def _where(condition: Array, v: Vector, otherwise: Vector) -> Vector:
+    return v.map(lambda a, b: jnp.where(condition, a, b), otherwise)
+
+
+def _pick_vector(chosen: tuple[Array, ...], values: tuple[Vector, ...]) -> Vector:
+    return Vector(tuple(pick(chosen, parts) for parts in zip(*values, strict=True)))
+
+
+__all__ = ["Books", "Floor", "strike"]

@@ -25,7 +25,7 @@ from ..state import State
 from ..status import Flag, Status
 from ..topology.base import Topology
 from ..vector import Vector
-from .base import Finding, Force, any_not_positive
+from .base import Finding, Force, Step, any_not_positive
 from .cutoffs import Cutoff, NoCutoff
 from .molten import Molten, check_springs
 from .pair_drag import PairDrag
@@ -154,9 +154,9 @@ class Fluid(Force):
             return replace(state, neighbours=self.pairs.begin(position, reach))
         return replace(state, neighbours=self.pairs.keep(state.neighbours, position, reach))
 
-    def update(self, before: State, state: State, dt: Array) -> tuple[State, Status]:
+    def update(self, step: Step, state: State) -> tuple[State, Status]:
         """The list brought up to date, and DT_LIMIT where dt is too long for two of the fastest particles that meet head-on."""
-        before, still, dt = stopped((before, state, dt))
+        before, still, dt = stopped((step.before, state, step.dt))
         memory, status = self._listed(before, still)
         limit, node = self.collision_dt(still)
         too_long = Status.when(Flag.DT_LIMIT, jnp.abs(dt) > limit, node=node)

@@ -29,6 +29,12 @@ class Stepper(eqx.Module):
     def step(self, system: System, state: State, dt: Array, memory: Any) -> tuple[State, Any]:
         """The state one `dt` [s] later, and what to carry. The caller sets the new state's time."""
 
+    def after_rules(self, system: System, before: State, moved: State, now: State, dt: Array, memory: Any) -> Any:
+        """What to carry where rules have changed positions or velocities: the step began at `before`, motion ended at `moved`, rules left
+        `now`. A stepper that carries what belongs to a place or a velocity makes it anew; called only where a rule may change them.
+        """
+        return memory
+
     @property
     def runs_backward(self) -> bool:
         """Whether dt may be negative."""

@@ -22,8 +22,10 @@ Source: slide "Mass-Spring Forces" for the update of x and v; limits from the ch
 from __future__ import annotations
 
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array
 
+from ..numerics import any_lane
 from ..state import State
 from ..system import System
 from ..vector import Vector
@@ -70,6 +72,12 @@ class VelocityVerlet(Stepper):
         predicted = system.stage(state.moved(x, state.velocity + dt * a, state.time + dt))
         a_new = system.acceleration(predicted)
         return state.moved(x, state.velocity + (0.5 * dt) * (a + a_new)), a_new
+
+    def after_rules(self, system: System, before: State, moved: State, now: State, dt: Array, memory: Vector) -> Vector:
+        """The acceleration where the rules have left the nodes, made anew in steps in which they changed any."""
+        pairs = [*zip(now.position, moved.position, strict=True), *zip(now.velocity, moved.velocity, strict=True)]
+        is_changed = jnp.any(jnp.stack([jnp.any(a != b) for a, b in pairs]))
+        return lax.cond(any_lane(is_changed), lambda: system.acceleration(now), lambda: memory)
 
     def limit(self, squared_frequency: Array, damping: Array, damping_floor: Array) -> Array:
         """2 / (c + sqrt(c^2 + w^2))."""

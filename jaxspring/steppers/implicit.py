@@ -223,6 +223,21 @@ class BDF2(ImplicitStepper):
         """The state before this step."""
         return jnp.ones((), bool), state.position, state.velocity
 
+    def after_rules(self, system: System, before: State, moved: State, now: State, dt: Array, memory: Memory) -> Memory:
+        """For nodes that rules have moved or kicked, the state dt ago from which this step's acceleration a would have led here:
+        x' - dt v' + dt^2 a / 2 and v' - dt a.
+        """
+        has_last, x, v = memory.history
+        change = now.velocity - moved.velocity, now.position - moved.position
+        is_kicked = jnp.any(jnp.stack([a != 0 for part in change for a in part]), axis=0)
+        gained = moved.velocity - before.velocity
+
+        def pick(new: Vector, old: Vector) -> Vector:
+            return new.map(lambda a, b: jnp.where(is_kicked, a, b), old)
+
+        past = now.position - dt * now.velocity + (0.5 * dt) * gained
+        return eqx.tree_at(lambda m: m.history, memory, (has_last, pick(past, x), pick(now.velocity - gained, v)))
+
     def stage(self, system: System, state: State, dt: Array, history: tuple[Array, Vector, Vector]) -> Stage:
         """Differences of this state and the last one, in the form that leaves a node at rest exactly where it is."""
         has_last, x, v = history

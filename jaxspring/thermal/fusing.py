@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._checks import as_inexact, finite, has_shape, nonnegative, positive
-from ..forces.base import Force, Rule
+from ..forces.base import Force, Rule, Step
 from ..forces.molten import Molten, check_springs
 from ..forces.springs import Springs
 from ..numerics import cast_inexact
@@ -124,7 +124,7 @@ class Fusing(Rule):
             state = dataclasses.replace(state, rest_length=self.net.own(state.rest_length.families))
         return state
 
-    def update(self, before: State, state: State, dt: Array) -> tuple[State, Status]:
+    def update(self, step: Step, state: State) -> tuple[State, Status]:
         """Springs broken where hot, and back where cold and near."""
         melting = self.melting.astype(state.dtype)
         warm = self.net.average(temperature_of(state, "Fusing"))

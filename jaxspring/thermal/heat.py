@@ -20,7 +20,7 @@ from jax import lax
 from jaxtyping import Array
 
 from .._checks import as_inexact, finite, nonnegative, positive
-from ..forces.base import Rule, any_refused
+from ..forces.base import Rule, Step, any_refused
 from ..linalg.operators import SpringBlocks
 from ..numerics import cast_inexact, stopped
 from ..state import State
@@ -142,8 +142,9 @@ class Heat(Rule):
         flow = ready.flow(state, cuts=False)
         return _left(flow, flow.hold(flow.entered(state.temperature, state.enthalpy)), state)
 
-    def update(self, before: State, state: State, dt: Array) -> tuple[State, Status]:
+    def update(self, step: Step, state: State) -> tuple[State, Status]:
         """Heat for a time dt, with the nodes where motion left them."""
+        before, dt = step.before, step.dt
         refused = Status.when(Flag.INVALID, dt < 0)
         ready = self.prepare(state.dtype)
         flow = ready.flow(state, cuts=self.cut_by is not None)

@@ -9,9 +9,8 @@ v is the velocity before the step, v'' the one after motion and all rules: what 
 that step. With symplectic Euler the kicks of forces and rules sum to the change of kinetic energy exactly. All entries together are the
 change of the columns to rounding. Momentum is kept alike: what motion and each rule gave.
 
-Contact puts back what the step has carried too far. That shift belongs to the step: else a node at rest on a floor, which falls g dt^2 in
-each step and is put back, would book m g^2 dt / 2 per second against the stepper, and the same for the floor. Where contact moves a node
-further than the step did, as one that starts below a floor, the shift of that step is the rule's.
+An impact counts as what it takes of the kinetic energy there, m (e^2 - 1) (n . w)^2 / 2, and as friction: the rest of the step that it
+splits is motion. A node at rest on a floor, which falls g dt^2 in each step and is put back, books nothing.
 
 Source: first law; the split of kicks is that of m (v''^2 - v^2) / 2 = (dt F + J) . (v + v'') / 2.
 """
@@ -26,7 +25,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..forces.base import Finding, Force, Rule
+from ..forces.base import Finding, Force, Rule, Step
+from ..forces.contact import Books, strike
 from ..forces.fluid import Fluid
 from ..numerics import cast_inexact
 from ..state import State
@@ -94,6 +94,11 @@ class Ledger(Rule):
         return next((net for net in (getattr(r, "net", None) for r in self.rules) if net is not None), None)
 
     @property
+    def obstacles(self) -> tuple[Rule, ...]:
+        """Those among its rules."""
+        return tuple(obstacle for rule in self.rules for obstacle in rule.obstacles)
+
+    @property
     def sets_temperature(self) -> bool:
         """Whether one of its rules does."""
         return any(rule.sets_temperature for rule in self.rules)
@@ -138,32 +143,49 @@ class Ledger(Rule):
         account = Account(now, now, work, jnp.zeros_like(now), books, jnp.zeros((1 + len(self.rules), state.dim), state.dtype))
         return dataclasses.replace(state, ledger=account)
 
-    def update(self, before: State, state: State, dt: Array) -> tuple[State, Status]:
-        """Every rule, with its entry."""
+    def update(self, step: Step, state: State) -> tuple[State, Status]:
+        """Every rule, with its entry: obstacles last, all of them together."""
         account: Account = state.ledger
-        stages, columns, status = [before, state], [account.now, self.columns(state)], Status.ok()
-        for rule in self.rules:
-            last = stages[-1]
-            state, seen = rule.update(before, last, dt)
+        before, status = step.before, Status.ok()
+        stages, columns, places = [before, state], [account.now, self.columns(state)], [-1]
+        for i, rule in enumerate(self.rules):
+            if not rule.obstacles:
+                last = state
+                state, seen = rule.update(step, last)
+                status = status.then(seen)
+                stages.append(state)
+                columns.append(self.columns(state, last, columns[-1]))
+                places.append(i)
+        struck = None
+        if self.obstacles:
+            last = state
+            state, seen, struck = strike(self.obstacles, step, last, books=True)
             status = status.then(seen)
             stages.append(state)
             columns.append(self.columns(state, last, columns[-1]))
+            places.append(-1)
         mean = 0.5 * (before.velocity + state.velocity)
-        books = [self._change(a, b, mean, x, y) for a, b, x, y in zip(stages, stages[1:], columns, columns[1:], strict=False)]
-        for i, rule in enumerate(self.rules):
-            if rule.is_contact:
-                shift = jnp.where(_is_within(before, stages[1 + i], stages[2 + i]), books[1 + i], 0).at[0].set(0)
-                books[0], books[1 + i] = books[0] + shift, books[1 + i] - shift
-        momenta = jnp.stack([self._momentum(stage) for stage in stages])
-        new = Account(
-            account.start,
-            columns[-1],
-            account.work + self._work(before, mean, dt),
-            account.motion + books[0],
-            account.rules + jnp.stack(books[1:]) if self.rules else account.rules,
-            account.impulses + momenta[1:] - momenta[:-1],
-        )
+        books, momenta = jnp.zeros_like(account.rules), jnp.zeros_like(account.impulses)
+        motion = jnp.zeros_like(account.motion)
+        for i, a, b, x, y in zip(places, stages, stages[1:], columns, columns[1:], strict=False):
+            change, given = self._change(a, b, mean, x, y), self._momentum(b) - self._momentum(a)
+            momenta = momenta.at[1 + i].add(given)
+            books, motion = (books, motion + change) if i < 0 else (books.at[i].add(change), motion)
+        if struck is not None:
+            books, motion, momenta = self._by_obstacle(state, struck, books, motion, momenta)
+        work = account.work + self._work(before, mean, step.dt)
+        new = Account(account.start, columns[-1], work, account.motion + motion, account.rules + books, account.impulses + momenta)
         return dataclasses.replace(state, ledger=new), status
+
+    def _by_obstacle(self, state: State, struck: Books, books: Array, motion: Array, momenta: Array) -> tuple[Array, Array, Array]:
+        """The entries, where what each obstacle took of energy and gave of momentum is its own and no longer motion's."""
+        mass, (work, given) = self._mass(state), struck
+        rows = [i for i, rule in enumerate(self.rules) if rule.obstacles]
+        for i, taken, velocity in zip(rows, work, given, strict=True):
+            energy, momentum = jnp.sum(mass * taken), jnp.stack([jnp.sum(mass * a) for a in velocity])
+            books, motion = books.at[i, 0].add(energy), motion.at[0].add(-energy)
+            momenta = momenta.at[1 + i].add(momentum).at[0].add(-momentum)
+        return books, motion, momenta
 
     def _change(self, a: State, b: State, mean: Vector, before: Array, after: Array) -> Array:
         """(2 + F,) what happened to the columns between two stages of a step: kicks at the mean velocity of the step [J]."""
@@ -210,14 +232,6 @@ class Ledger(Rule):
     def _mass(self, state: State) -> Array:
         self._forces()
         return jnp.asarray(self.mass, state.dtype)
-
-
-def _is_within(before: State, moved: State, put_back: State) -> Array:
-    """Whether no node was put back further than the step had carried it; the small excess is rounding of positions."""
-    shift, step = put_back.position - moved.position, moved.position - before.position
-    size = jnp.sqrt(jnp.max(before.position.dot(before.position)))
-    excess = 8 * jnp.finfo(before.dtype).eps * size
-    return jnp.all(jnp.sqrt(shift.dot(shift)) <= jnp.sqrt(step.dot(step)) + excess)
 
 
 def energy_ledger(system: Any, state: State) -> dict[str, Any]:

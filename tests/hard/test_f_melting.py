@@ -21,8 +21,8 @@ class CutAt(Rule):
     cold: jnp.ndarray
     hot: jnp.ndarray
 
-    def update(self, before, state, dt):
-        is_now = jnp.round(state.time / dt) == self.step
+    def update(self, step, state):
+        is_now = jnp.round(state.time / step.dt) == self.step
         return dataclasses.replace(state, temperature=jnp.where(is_now, self.hot, self.cold)), Status.ok()
 
 

@@ -67,10 +67,10 @@ class Warmed(Rule):
     temperatures: jax.Array
     points: jax.Array
 
-    def update(self, before, state, dt):
-        step = jnp.round(state.time / dt).astype(int) - 1
-        there = js.State.from_points(NET, self.points[step])
-        return dataclasses.replace(state, position=there.position, temperature=self.temperatures[step].reshape(3, 4)), Status.ok()
+    def update(self, step, state):
+        entry = jnp.round(state.time / step.dt).astype(int) - 1
+        there = js.State.from_points(NET, self.points[entry])
+        return dataclasses.replace(state, position=there.position, temperature=self.temperatures[entry].reshape(3, 4)), Status.ok()
 
 
 @jax.jit

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import jaxspring as js
+from jaxspring.forces.base import Step
 
 CHAIN = js.lattice(5)
 SHEET = js.lattice((4, 5), js.STRUCTURAL + js.SHEAR)
@@ -128,7 +129,7 @@ def test_a_melting_point_that_slipped_in_is_reported():
     """NaN put in after construction, by which nothing would ever melt, gives INVALID."""
     rule = eqx.tree_at(lambda r: r.melting, js.Fusing(CHAIN, 350.0), jnp.asarray(jnp.nan))
     state = rule.begin(warm(CHAIN, 400.0))
-    assert bool(rule.update(state, state, jnp.asarray(0.1))[1].has(js.Flag.INVALID))
+    assert bool(rule.update(Step(state, state, jnp.asarray(0.1)), state)[1].has(js.Flag.INVALID))
 
 
 def test_broken_springs_by_where():
@@ -182,44 +183,59 @@ def test_fusing_beside_springs_of_other_nets():
     js.System(BARE, 1.0, js.Drag(1.0), rules=js.Fusing(BARE, 350.0)).prepare(float)
 
 
-def on_floor(velocity, friction=0.0, restitution=0.0, height=-0.1):
-    """One node 0.1 m below the floor, or at this height, with this velocity, after the floor."""
+# Compiled: one operation at a time it takes seconds.
+after_floor = eqx.filter_jit(lambda floor, step, state: floor.update(step, state))
+
+
+def on_floor(velocity, friction=0.0, restitution=0.0, height=0.1):
+    """One node that flew with this velocity for 0.1 s and would end 0.1 m below the floor, or begins at this height; after the floor."""
     net = js.lattice(1)
     floor = js.Floor((0.0, 0.0), (0.0, 1.0), friction, restitution)
-    state = js.State.from_points(net, [[0.0, height]], [velocity])
-    return floor.update(state, state, jnp.asarray(0.1))[0]
+    before = js.State.from_points(net, [[0.0, height]], [velocity])
+    moved = before.moved(before.position + 0.1 * before.velocity, before.velocity)
+    return after_floor(floor, Step(before, moved, jnp.asarray(0.1)), moved)[0]
 
 
 def test_floor():
-    """The node is on the plane; inward speed goes or comes back; friction takes mu times the normal impulse, and at most all."""
-    assert on_floor((3.0, -2.0)).points.tolist() == [[0, 0]]
-    np.testing.assert_allclose(on_floor((3.0, -2.0)).velocities, [[3, 0]])
-    np.testing.assert_allclose(on_floor((3.0, -2.0), restitution=0.5).velocities, [[3, 1]])
-    np.testing.assert_allclose(on_floor((3.0, -2.0), friction=0.4).velocities, [[3 - 0.4 * 2, 0]])
-    np.testing.assert_allclose(on_floor((3.0, -2.0), friction=4.0).velocities, [[0, 0]], atol=1e-15)
-    np.testing.assert_allclose(on_floor((3.0, 2.0), friction=4.0).velocities, [[3, 2]])
+    """From the impact on, half a step, the node goes out with e times the speed; friction takes mu times the impulse, and at most all."""
+    fast = (3.0, -2.0)
+    np.testing.assert_allclose(on_floor(fast).points, [[0.3, 0]], atol=1e-15)
+    np.testing.assert_allclose(on_floor(fast).velocities, [[3, 0]])
+    half = on_floor(fast, restitution=0.5)
+    np.testing.assert_allclose((half.points, half.velocities), ([[0.3, 0.05]], [[3, 1]]), atol=1e-15)
+    slowed = on_floor(fast, friction=0.4)
+    np.testing.assert_allclose((slowed.points, slowed.velocities), ([[0.3 - 0.05 * 0.8, 0]], [[3 - 0.4 * 2, 0]]), atol=1e-15)
+    stopped = on_floor(fast, friction=4.0)
+    np.testing.assert_allclose((stopped.points, stopped.velocities), ([[0.15, 0]], [[0, 0]]), atol=1e-15)
     # What is thrown back presses more, and is braked more: by mu (1 + e) times the inward speed.
-    np.testing.assert_allclose(on_floor((3.0, -2.0), 0.4, 0.5).velocities, [[3 - 0.4 * 1.5 * 2, 1]])
-    # Above it nothing happens, however fast the node comes.
-    above = on_floor((3.0, -2.0), 0.4, 0.5, height=0.1)
-    assert (above.points.tolist(), above.velocities.tolist()) == ([[0, 0.1]], [[3, -2]])
+    np.testing.assert_allclose(on_floor(fast, 0.4, 0.5).velocities, [[3 - 0.4 * 1.5 * 2, 1]])
+    # Above it nothing happens, however fast the node comes, and nothing to one that goes up.
+    above = on_floor(fast, 0.4, 0.5, height=0.3)
+    np.testing.assert_allclose((above.points, above.velocities), ([[0.3, 0.1]], [[3, -2]]), atol=1e-15)
+    np.testing.assert_allclose(on_floor((3.0, 2.0), 4.0, height=0.0).velocities, [[3, 2]])
+    # What begins below goes no deeper, and is not lifted.
+    np.testing.assert_allclose(on_floor(fast, height=-0.2).points, [[0.3, -0.2]], atol=1e-15)
+    np.testing.assert_allclose(on_floor((3.0, 1.0), height=-0.2).points, [[0.3, -0.1]], atol=1e-15)
 
 
 def test_floor_anywhere(rng):
-    """A plane in space that is not through the origin: x - ((x - p) . n) n for nodes below it, the inward part of the velocity gone."""
+    """A plane in space that is not through the origin: nodes that pass it in a step without forces end on it, their inward speed gone."""
     net, p, n = js.lattice(6), np.array([0.3, -2.0, 1.0]), np.array([1.0, 2.0, -2.0])
-    x, v, unit = rng.normal(size=(6, 3)) + p, rng.normal(size=(6, 3)), n / 3
-    state = js.State.from_points(net, x, v)
-    end, status = js.Floor(p, n).update(state, state, jnp.asarray(0.1))
-    height, inward = (x - p) @ unit, np.minimum(v @ unit, 0)
+    unit = n / 3
+    x, v = p + rng.normal(size=(6, 3)) * 0.1 + 0.5 * unit, 10 * rng.normal(size=(6, 3))
+    before = js.State.from_points(net, x, v)
+    moved = before.moved(before.position + 0.1 * before.velocity, before.velocity)
+    end, status = after_floor(js.Floor(p, n), Step(before, moved, jnp.asarray(0.1)), moved)
+    flown = x + 0.1 * v
+    height = (flown - p) @ unit
     assert 0 < (height < 0).sum() < 6
-    np.testing.assert_allclose(end.points, x - np.minimum(height, 0)[:, None] * unit, atol=1e-14)
-    np.testing.assert_allclose(end.velocities, v - np.where(height < 0, inward, 0)[:, None] * unit, atol=1e-14)
+    np.testing.assert_allclose(end.points, flown - np.minimum(height, 0)[:, None] * unit, atol=1e-14)
+    np.testing.assert_allclose(end.velocities, v - np.where(height < 0, v @ unit, 0)[:, None] * unit, atol=1e-14)
     assert int(status.flags) == 0
 
 
 def test_a_floor_does_not_run_backward():
     """What a floor took is gone: a step back in time is INVALID."""
     state = js.State.from_points(CHAIN, CHAIN.grid())
-    status = js.Floor((0.0,), (1.0,)).update(state, state, jnp.asarray(-0.1))[1]
+    status = after_floor(js.Floor((0.0,), (1.0,)), Step(state, state, jnp.asarray(-0.1)), state)[1]
     assert bool(status.has(js.Flag.INVALID))

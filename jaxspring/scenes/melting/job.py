@@ -18,6 +18,7 @@ import numpy as np
 
 from ...archive import atomic_folder, read_archive, write_archive
 from ...files import expect_same, named_arrays, restored
+from ...forces.base import Step
 from ...progress import Progress, Stopwatch
 from ...rollouts import rollout
 from ...state import State
@@ -223,7 +224,7 @@ def seconds_per_effect(scene: Melting, end: State, repeats: int = 10) -> dict[st
     for force in ready.forces:
         found[type(force).__name__] = _fastest(eqx.filter_jit(lambda f, s: f.force(s)), (force, end), repeats)
     for rule in rules:
-        found[type(rule).__name__] = _fastest(eqx.filter_jit(lambda r, s: r.update(s, s, dt)), (rule, end), repeats)
+        found[type(rule).__name__] = _fastest(eqx.filter_jit(lambda r, s: r.update(Step(s, s, dt), s)), (rule, end), repeats)
     return found
 
 

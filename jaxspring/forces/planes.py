@@ -1,0 +1,82 @@
+"""What an impact on a plane is made of: heights, the time of meeting, directions taken away, the share that friction takes.
+
+Source: the stable root of a quadratic as in Press and others, Numerical Recipes (2007), 5.6.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ..vector import Vector
+
+ROUNDING = 16  # of the terms of a height, in units of the last place
+
+
+class Plane(eqx.Module):
+    """A plane as an impact sees it.
+
+    Attributes:
+        point: D numbers [m], 0-d arrays.
+        normal: D numbers, of length one.
+        friction: mu.
+        restitution: e.
+    """
+
+    point: Vector
+    normal: Vector
+    friction: Array
+    restitution: Array
+
+    def height(self, position: Vector) -> Array:
+        """(x - p) . n [m]."""
+        return (position - self.point).dot(self.normal)
+
+    def rounding(self, position: Vector) -> Array:
+        """Below which a height is rounding [m]."""
+        size = position.map(jnp.abs) + self.point.map(jnp.abs)
+        return ROUNDING * float(jnp.finfo(position.dtype).eps) * size.dot(self.normal.map(jnp.abs))
+
+
+def meeting(s: Array, u: Array, a: Array, left: Array, at_once: Array) -> tuple[Array, Array]:
+    """First time in which s + u t + a t^2 / 2 comes down through 0 [s], and whether it does within `left`; 0 where it does not, and 0
+    without a derivative where it does `at_once`: that of a node at rest is infinite and means nothing.
+    """
+    sinks = (s + left * (u + 0.5 * left * a) < 0) & ((u <= 0) | (a < 0))
+    square = u * u - 2 * a * s
+    dips = (a > 0) & (u < 0) & (u + a * left > 0) & (square > 0)
+    meets = sinks | dips
+    one, zero = jnp.ones_like(s), jnp.zeros_like(s)
+    # Chosen before the root and the quotient, so that their derivatives are finite everywhere.
+    is_real = meets & (square > 0)
+    root = jnp.where(is_real, jnp.sqrt(jnp.where(is_real, square, one)), zero)
+    falls = meets & (u > 0)
+    top, bottom = jnp.where(falls, u + root, 2 * s), jnp.where(falls, -a, root - u)
+    is_apart = meets & ~at_once & (bottom > 0)
+    return jnp.where(is_apart, top / jnp.where(is_apart, bottom, one), zero), meets
+
+
+def without(v: Vector, basis: tuple[Vector, ...]) -> Vector:
+    """`v` without its parts along these directions of length one (or zero)."""
+    for e in basis:
+        v = v - v.dot(e) * e
+    return v
+
+
+def braked(pull: Array, along: Vector) -> Array:
+    """Which part of a tangential velocity friction takes that could take `pull` of it [m/s]; 0 where there is none."""
+    speed = along.norm()
+    is_sliding, one = speed > 0, jnp.ones_like(speed)
+    return jnp.where(is_sliding, jnp.minimum(pull / jnp.where(is_sliding, speed, one), one), jnp.zeros_like(speed))
+
+
+def pick(chosen: tuple[Array, ...], values: tuple[Array, ...]) -> Array:
+    """The value of the chosen plane; one plane's alone is no choice."""
+    found = values[0]
+    for c, value in zip(chosen[1:], values[1:], strict=True):
+        found = jnp.where(c, value, found)
+    return found
+
+
+__all__ = ["Plane", "braked", "meeting", "pick", "without"]

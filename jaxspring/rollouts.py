@@ -213,7 +213,7 @@ def _proceed(begun: _Begun, job: _Job, progress: Progress | None = None) -> Resu
             jax.debug.callback(partial(progress.update, total=job.plan.n_steps), carry.step)
 
     first = stopped(carry)
-    (carry, status), frames = run_blocks(advance, partial(inspect, ready), job.keep, report, (carry, begun.status), job.plan)
+    (carry, status), frames = run_blocks(advance, partial(inspect, ready, begun.state), job.keep, report, (carry, begun.status), job.plan)
     saved, solves_saved = (None, None) if frames is None else frames
     if carry.solves is None:
         # The replay of a failed run is not part of what is differentiated.

@@ -40,6 +40,7 @@ class Flag(enum.IntFlag):
     PRECISION = 32768
     SOLVER = 65536
     UNSTABLE = 131072
+    BOX = 262144
 
 
 WARNINGS = Flag.COINCIDENT | Flag.OVERLAP | Flag.OUTSIDE | Flag.DT_LIMIT | Flag.PRECISION
@@ -62,6 +63,8 @@ EXPLANATION = {
     Flag.PRECISION: "rounding of such large coordinates spoils the springs' forces; move the scene to the origin, or use float64",
     Flag.SOLVER: "the solver gave up: its solve did not reach the accuracy it needs, or its step shrank to the least allowed",
     Flag.UNSTABLE: "the forces balance, but the shape is no minimum of the energy: a small push makes it buckle; start from one",
+    Flag.BOX: "the box is too small: a spring has reached half a period, where its pull turns to another image of its node, or a fluid's "
+    "cut-off is beyond it; use a larger box, shorter springs or cut-off",
     Flag.INVALID: "a parameter has a value that its constructor would refuse (sign, NaN or infinity)",
 }
 

@@ -24,6 +24,7 @@ from .numerics import cast_inexact
 from .state import State
 from .status import Status
 from .topology.base import Topology
+from .topology.periods import box_of
 from .vector import Vector
 
 Free = Array | tuple[Array, ...] | None
@@ -106,7 +107,7 @@ class System(eqx.Module):
 
     def _cast(self, effect: Force, state: State) -> Force:
         """The effect in its system, and constants of the state's dtype: float32 in, float32 out, whatever the constants were."""
-        return cast_inexact(effect.with_mass(self.mass).with_forces(self.forces), state.dtype)
+        return cast_inexact(effect.with_box(box_of(self.net)).with_mass(self.mass).with_forces(self.forces), state.dtype)
 
     def _adopt(self, i: int, force: Any) -> Force:
         if isinstance(force, Rule) and not isinstance(force, Force):
@@ -124,6 +125,7 @@ class System(eqx.Module):
         other = getattr(effect, "net", None)
         if other is not None and (other.node_shape != self.net.node_shape or other.node_permutation != self.net.node_permutation):
             raise ValueError(f"{name} ({type(effect).__name__}) was built on another topology than the system.")
+        effect.with_box(box_of(self.net))  # refuses a box that is too small
         return effect
 
     @property
@@ -159,11 +161,12 @@ class System(eqx.Module):
 
     def prepare(self, dtype: Any) -> System:
         """The system as a loop wants it: every constant in the shape of the topology and of `dtype`."""
-        alone = tuple(f.with_mass(self.mass).prepare(dtype) for f in self.forces)
+        box = box_of(self.net)
+        alone = tuple(f.with_box(box).with_mass(self.mass).prepare(dtype) for f in self.forces)
         forces = tuple(f.with_forces(alone) for f in alone)
         ready = eqx.tree_at(lambda s: s.forces, self, forces)
         if self.rules:
-            rules = tuple(r.with_mass(self.mass).with_forces(forces).prepare(dtype) for r in self.rules)
+            rules = tuple(r.with_box(box).with_mass(self.mass).with_forces(forces).prepare(dtype) for r in self.rules)
             ready = eqx.tree_at(lambda s: s.rules, ready, rules)
         return cast_inexact(ready, dtype)
 

@@ -12,7 +12,9 @@ from functools import partial
 from typing import Any, TypeGuard
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from .._checks import finite, is_concrete, nonnegative, positive
@@ -22,6 +24,7 @@ from ..state import State
 from ..status import Flag
 from ..topology.base import Topology
 from ..topology.edge_field import EdgeField, ZeroOutside
+from ..topology.periods import along_axes, box_of, half_period, longest, turned
 from ..vector import Vector
 from .base import Finding, Force, any_refused
 from .laws import Hooke, Law, PowerLaw, spring_block, spring_energy, spring_pull
@@ -81,7 +84,8 @@ class Springs(Force):
     that have changed take the place of the given ones.
 
     Raises:
-        ValueError: a negative or non-finite constant (named with its index), a shape that fits neither one number nor one per spring.
+        ValueError: a negative or non-finite constant (named with its index), a shape that fits neither one number nor one per spring, a
+            rest length that no image of the net's box can have.
     """
 
     net: Topology
@@ -113,6 +117,8 @@ class Springs(Force):
             why = "A negative stiffness pushes without bound. Pass allow_negative_stiffness=True if meant."
             _check_sign("stiffness", self.stiffness, why, any_sign=allow_negative_stiffness)
         _check_sign("rest_length", self.rest_length, "A length cannot be negative.")
+        if self.axes is None:
+            check_rest_length(net, self.rest_length)
         if isinstance(self.law, PowerLaw):
             for entry in self.rest_length.families if isinstance(self.rest_length, EdgeField) else (self.rest_length,):
                 positive("rest_length", entry, "The power law divides by it.")
@@ -132,7 +138,7 @@ class Springs(Force):
         if self.net.n_springs == 0:
             return Vector.zeros_like(state.position)
         if isinstance(self.stiffness, ZeroOutside) and self.law.is_finite_at_zero:
-            return self._embed(self.net.net_pull(partial(spring_pull, self.law), self._seen(state), *self._constants(state)), state)
+            return self._embed(self._near().net_pull(partial(spring_pull, self.law), self._seen(state), *self._constants(state)), state)
         d, k, l = self._along(state)
         pulls = self.net.map_springs(partial(spring_pull, self.law), d, k, l)
         return self._embed(self.net.accumulate(pulls), state)
@@ -188,10 +194,17 @@ class Springs(Force):
         return 2 * self.net.incident_sum(k)
 
     def diagnose(self, state: State) -> tuple[Finding, ...]:
-        """COINCIDENT: springs with a rest length whose ends are at one place."""
-        given = state.rest_length is None and is_concrete(self.rest_length)
-        if self.net.n_springs == 0 or (given and not jnp.any(self.rest_length > 0)):
+        """COINCIDENT: springs with a rest length whose ends are at one place. BOX: springs of half a period."""
+        if self.net.n_springs == 0:
             return ()
+        nowhere = jnp.asarray(-1, jnp.int32)
+        findings = ()
+        if box_of(self.net) is not None:
+            count = half_period(self._near(), self._near().difference(self._seen(state)), self._alive(state))
+            findings = (Finding(Flag.BOX, count, nowhere),)
+        given = state.rest_length is None and is_concrete(self.rest_length)
+        if given and not jnp.any(self.rest_length > 0):
+            return findings
         d, _, l = self._along(state)
 
         def degenerate(d: Vector, l: Array) -> Array:
@@ -199,12 +212,21 @@ class Springs(Force):
             return ((squared <= tiny(squared.dtype)) & (l > 0)).astype(jnp.int32)
 
         count = self.net.sum(self.net.map_springs(degenerate, d, l))
-        return (Finding(Flag.COINCIDENT, count, jnp.asarray(-1, jnp.int32)),)
+        return (*findings, Finding(Flag.COINCIDENT, count, nowhere))
+
+    def diagnose_since(self, start: State, state: State) -> tuple[Finding, ...]:
+        """BOX: springs that pull to another image than at the start."""
+        if self.net.n_springs == 0 or box_of(self.net) is None:
+            return ()
+        count = turned(self._near(), self._seen(start), self._seen(state), self._alive(state))
+        return (Finding(Flag.BOX, count, jnp.asarray(-1, jnp.int32)),)
 
     def invalid(self) -> Array | None:
         """Whether a constant is negative or not finite."""
         rule = self.stiffness
         bad = any_refused(self.rest_length, *(() if isinstance(rule, StiffnessRule) or self.allow_negative_stiffness else (rule,)))
+        if box_of(self.net) is not None:
+            bad = bad | any_refused(box_of(self.net))
         by_rule = rule.invalid() if isinstance(rule, StiffnessRule) else None
         bad = bad if by_rule is None else bad | by_rule
         by_expansion = None if self.expansion is None else self.expansion.invalid()
@@ -246,6 +268,13 @@ class Springs(Force):
     def _seen(self, state: State) -> Vector:
         return state.position if self.axes is None else Vector(tuple(state.position[a] for a in self.axes))
 
+    def _near(self) -> Topology:
+        """The net with the periods of the coordinates that the springs act in."""
+        return along_axes(self.net, self.axes)
+
+    def _alive(self, state: State) -> EdgeField | None:
+        return state.alive if self._is_of_this_net(state.alive) else None
+
     def _constants(self, state: State) -> tuple[Array | EdgeField, Array | EdgeField]:
         rule = self.stiffness
         k = rule.stiffness(self.net, state) if isinstance(rule, StiffnessRule) else self.net.edge_field(rule, "stiffness")
@@ -257,7 +286,7 @@ class Springs(Force):
 
     def _along(self, state: State) -> tuple[EdgeField, Array | EdgeField, Array | EdgeField]:
         k, l = self._constants(state)
-        d = self.net.difference(self._seen(state))
+        d = self._near().difference(self._seen(state))
         return d if self.law.is_finite_at_zero else self._filled(d), k, l
 
     def _filled(self, d: EdgeField) -> EdgeField:
@@ -295,6 +324,22 @@ def _edge_constant(net: Topology, name: str, value: Any) -> Any:
     value = as_inexact(name, value)
     has_shape(name, value, {"one number": (), "one per spring": (net.n_springs,)})
     return value
+
+
+def check_rest_length(net: Topology, rest_length: Any) -> None:
+    """Raise ValueError for a rest length that no nearest image of the net's box has."""
+    most = longest(box_of(net))
+    if most == np.inf or not all(is_concrete(leaf) for leaf in jax.tree.leaves(rest_length)):
+        return
+    lengths = np.asarray(net.flatten(rest_length) if isinstance(rest_length, EdgeField) else rest_length)
+    bad = lengths > most
+    if bad.any():
+        spring = int(np.argmax(bad))
+        where = f"[{spring}]" if lengths.ndim else ""
+        raise ValueError(
+            f"rest_length{where} = {np.ravel(lengths)[spring]} m, but in a box of {np.asarray(box_of(net))} m no two nodes are more than "
+            f"{most:.9g} m apart: a spring takes the nearest image, and its pull would turn. Use a larger box, or shorter springs."
+        )
 
 
 def _check_sign(name: str, value: Any, why: str, any_sign: bool = False) -> None:

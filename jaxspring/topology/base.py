@@ -22,6 +22,7 @@ from jaxtyping import Array
 from .._checks import as_inexact, finite, has_shape, shape_of
 from ..vector import Vector
 from .edge_field import EdgeField
+from .periods import box_of, check_dim
 from .permutation import Permutation
 
 
@@ -163,6 +164,7 @@ class Topology(eqx.Module):
         points = as_inexact(name, points)
         if points.ndim != 2 or points.shape[0] != self.n_nodes or points.shape[1] not in (1, 2, 3):
             raise ValueError(f"{name} has shape {points.shape}; expected ({self.n_nodes}, D) with D = 1, 2 or 3 coordinates.")
+        check_dim(box_of(self), points.shape[1])
         finite(name, points)
         return Vector(tuple(self._order_nodes(points[:, i]) for i in range(points.shape[1])))
 

@@ -19,7 +19,7 @@ from .._checks import node_indices
 from ..vector import Vector
 from .base import Topology
 from .edge_field import EdgeField
-from .lattice import _as_box, minimum_image
+from .periods import as_box, minimum_image
 from .permutation import Permutation
 from .reduction import Gather, Reduction, Scatter, choose_reduction
 
@@ -59,7 +59,7 @@ class Graph(Topology):
                 None takes `Gather`, but `Scatter` on a CPU for more nodes than `FASTER_BY_SCATTER`.
 
         Raises:
-            ValueError: no node, a node that does not exist, a spring that joins a node to itself.
+            ValueError: no node, a node that does not exist, a spring that joins a node to itself, a period that is negative or not finite.
             TypeError: node numbers that are not integers.
 
         >>> net = Graph.from_edges([(0, 1), (1, 2)], n_nodes=3)
@@ -80,7 +80,7 @@ class Graph(Topology):
             tails=jnp.asarray(tails),
             heads=jnp.asarray(heads),
             reduction=sums,
-            box=_as_box(box),
+            box=as_box(box),
             triangles=None if triangles is None else np.asarray(triangles, np.int32),
             count=int(n_nodes),
             nodes=nodes,

@@ -23,7 +23,7 @@ from .linalg.operators import Blocks, SpringMatrix
 from .numerics import cast_inexact
 from .state import State
 from .status import Status
-from .topology.base import Topology
+from .topology.base import Topology, about_middle
 from .topology.periods import box_of
 from .vector import Vector
 
@@ -276,10 +276,10 @@ def lumped_mass(net: Topology, points: Any, density: Any, triangles: Any = None)
     """
     density = as_inexact("density", density)
     positive("density", density, "A node without mass would get an infinite acceleration.")
-    points = as_inexact("points", points)
     if triangles is None:
         lengths = net.lengths(points)
         return net.flatten_nodes(net.incident_sum(net.split(0.5 * density * lengths)))
+    points = as_inexact("points", about_middle(points))
     corners = np.asarray(triangles)
     a, b, c = (points[corners[:, i]] for i in range(3))
     u, v = b - a, c - a

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -41,6 +42,13 @@ class NodeLayout:
     def unflatten(self, flat: Array) -> Array:
         """(N,) in the user's order -> node array."""
         return (flat if self.permutation is None else self.permutation.inward(flat)).reshape(self.shape)
+
+
+def about_middle(points: Any) -> Any:
+    """(N, D) points of float64 where JAX has 32 bits: about their middle, for what no shift changes. All others as they are."""
+    if not isinstance(points, np.ndarray) or points.dtype != np.float64 or points.ndim != 2 or not points.size or jax.config.jax_enable_x64:
+        return points
+    return points - points.mean(axis=0)
 
 
 class Topology(eqx.Module):
@@ -174,7 +182,7 @@ class Topology(eqx.Module):
 
     def lengths(self, position: Any) -> Array:
         """(E,) lengths of the springs [m] in the user's order, for a `Vector` or an (N, D) array of positions."""
-        x = position if isinstance(position, Vector) else self.vector_field(position, "position")
+        x = position if isinstance(position, Vector) else self.vector_field(about_middle(position), "position")
         return self.flatten(self.difference(x).map(lambda d: d.norm()))
 
     def _order_nodes(self, flat: Array) -> Array:

@@ -83,9 +83,8 @@ def _by_trimesh(path: pathlib.Path) -> Any:
     known, suffix = {f".{name}" for name in trimesh.available_formats()}, path.suffix.lower()
     if suffix not in known:
         if suffix in NEEDED:
-            raise ImportError(
-                f"{path}: trimesh reads {suffix} files with {NEEDED[suffix]}, which is missing. Run: pip install {NEEDED[suffix]}"
-            )
+            package = NEEDED[suffix]
+            raise ImportError(f"{path}: trimesh reads {suffix} files with {package}, which is not installed. Run: pip install {package}")
         raise ValueError(f"{path} is of no format that is read here: {', '.join(sorted(known | set(READERS)))}.")
 
     def read(path: pathlib.Path) -> RawMesh:

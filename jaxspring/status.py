@@ -60,7 +60,7 @@ EXPLANATION = {
     Flag.MAX_STEPS: "the adaptive solver ran out of steps; raise max_steps or loosen the tolerance",
     Flag.INTERRUPTED: "interrupted; the result holds what was done until then",
     Flag.DT_LIMIT: "dt is too long: above the stability limit (see stable_dt), or for particles that move or meet so fast",
-    Flag.PRECISION: "rounding of such large coordinates spoils the springs' forces; move the scene to the origin, or use float64",
+    Flag.PRECISION: "rounding of such large coordinates spoils the forces; move the scene to the origin, or use float64",
     Flag.SOLVER: "the solver gave up: its solve did not reach the accuracy it needs, or its step shrank to the least allowed",
     Flag.UNSTABLE: "the forces balance, but the shape is no minimum of the energy: a small push makes it buckle; start from one",
     Flag.BOX: "the box is too small: a spring has reached half a period, where its pull turns to another image of its node, or a fluid's "

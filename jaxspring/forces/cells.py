@@ -194,7 +194,7 @@ def _runs_around(per_axis: int, counts: tuple[Any, ...]) -> tuple[Any, Any]:
     has_wrapped = ((along == 0) | (along == last_count - 1)) & (last_count > 2)
     first, last = [], []
     for offset in itertools.product((-1, 0, 1), repeat=dim - 1):
-        row, is_new = np.zeros_like(along), True
+        row, is_new = np.zeros_like(where[-1]), True
         for coordinate, count, step in zip(where[:-1], counts[:-1], offset, strict=True):
             row = row * per_axis + (coordinate + step) % count
             # Of two cells the one below is the one above, and of one cell both are itself.

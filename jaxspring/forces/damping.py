@@ -22,7 +22,8 @@ from ..state import State
 from ..topology.base import Topology
 from ..topology.edge_field import EdgeField
 from ..vector import Vector
-from .base import Force, any_refused
+from .base import Finding, Force, any_refused
+from .in_box import long_springs, turned_springs
 from .springs import _check_sign, _edge_constant
 
 
@@ -116,6 +117,14 @@ class Dashpots(Force):
         slope = self.net.map_springs(lambda d, c: jnp.broadcast_to(c, d.shape).astype(d.dtype), d, self.net.edge_field(self.damping))
         direction = d.map(lambda d: _inverse_length(d) * d)
         return Blocks(springs=(SpringBlocks(self.net, slope * 0, slope, direction),))
+
+    def diagnose(self, state: State) -> tuple[Finding, ...]:
+        """BOX: dampers of half a period."""
+        return () if self.net.n_springs == 0 else long_springs(self.net, state.position, None)
+
+    def diagnose_since(self, start: State, state: State) -> tuple[Finding, ...]:
+        """BOX: dampers that act toward another image than at the start."""
+        return () if self.net.n_springs == 0 else turned_springs(self.net, start.position, state.position, None)
 
     def can_feed(self, state: State) -> bool:
         """No: a damper takes energy out."""

@@ -175,6 +175,11 @@ class Fluid(Force):
             findings = (*findings, Finding(Flag.BOX, bad.astype(jnp.int32), nowhere))
         return findings if needed is None else (Finding(Flag.NEIGHBOUR_OVERFLOW, needed, nowhere), *findings)
 
+    def rounding(self, state: State) -> Array:
+        """The largest coordinate's rounding over the equilibrium distance."""
+        largest = jnp.max(jnp.stack([jnp.max(jnp.abs(a)) for a in state.position]))
+        return largest * jnp.asarray(jnp.finfo(state.dtype).eps, state.dtype) / self.law.equilibrium_distance.astype(state.dtype)
+
     def begin(self, state: State) -> State:
         """The state with the list that its pairs reuse: its own where it serves, else a new one."""
         position, reach = stopped(self._flat(state)), self.cutoff.reach

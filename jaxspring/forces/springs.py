@@ -12,9 +12,7 @@ from functools import partial
 from typing import Any, TypeGuard
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array
 
 from .._checks import finite, is_concrete, nonnegative, positive
@@ -24,9 +22,10 @@ from ..state import State
 from ..status import Flag
 from ..topology.base import Topology
 from ..topology.edge_field import EdgeField, ZeroOutside
-from ..topology.periods import along_axes, box_of, half_period, longest, turned
+from ..topology.periods import along_axes, box_of
 from ..vector import Vector
 from .base import Finding, Force, any_refused
+from .in_box import check_rest_length, long_springs, turned_springs
 from .laws import Hooke, Law, PowerLaw, spring_block, spring_energy, spring_pull
 from .linearisation import Linearisation
 
@@ -197,11 +196,7 @@ class Springs(Force):
         """COINCIDENT: springs with a rest length whose ends are at one place. BOX: springs of half a period."""
         if self.net.n_springs == 0:
             return ()
-        nowhere = jnp.asarray(-1, jnp.int32)
-        findings = ()
-        if box_of(self.net) is not None:
-            count = half_period(self._near(), self._near().difference(self._seen(state)), self._alive(state))
-            findings = (Finding(Flag.BOX, count, nowhere),)
+        findings = long_springs(self._near(), self._seen(state), self._alive(state))
         given = state.rest_length is None and is_concrete(self.rest_length)
         if given and not jnp.any(self.rest_length > 0):
             return findings
@@ -212,14 +207,13 @@ class Springs(Force):
             return ((squared <= tiny(squared.dtype)) & (l > 0)).astype(jnp.int32)
 
         count = self.net.sum(self.net.map_springs(degenerate, d, l))
-        return (*findings, Finding(Flag.COINCIDENT, count, nowhere))
+        return (*findings, Finding(Flag.COINCIDENT, count, jnp.asarray(-1, jnp.int32)))
 
     def diagnose_since(self, start: State, state: State) -> tuple[Finding, ...]:
         """BOX: springs that pull to another image than at the start."""
-        if self.net.n_springs == 0 or box_of(self.net) is None:
+        if self.net.n_springs == 0:
             return ()
-        count = turned(self._near(), self._seen(start), self._seen(state), self._alive(state))
-        return (Finding(Flag.BOX, count, jnp.asarray(-1, jnp.int32)),)
+        return turned_springs(self._near(), self._seen(start), self._seen(state), self._alive(state))
 
     def invalid(self) -> Array | None:
         """Whether a constant is negative or not finite."""
@@ -324,22 +318,6 @@ def _edge_constant(net: Topology, name: str, value: Any) -> Any:
     value = as_inexact(name, value)
     has_shape(name, value, {"one number": (), "one per spring": (net.n_springs,)})
     return value
-
-
-def check_rest_length(net: Topology, rest_length: Any) -> None:
-    """Raise ValueError for a rest length that no nearest image of the net's box has."""
-    most = longest(box_of(net))
-    if most == np.inf or not all(is_concrete(leaf) for leaf in jax.tree.leaves(rest_length)):
-        return
-    lengths = np.asarray(net.flatten(rest_length) if isinstance(rest_length, EdgeField) else rest_length)
-    bad = lengths > most
-    if bad.any():
-        spring = int(np.argmax(bad))
-        where = f"[{spring}]" if lengths.ndim else ""
-        raise ValueError(
-            f"rest_length{where} = {np.ravel(lengths)[spring]} m, but in a box of {np.asarray(box_of(net))} m no two nodes are more than "
-            f"{most:.9g} m apart: a spring takes the nearest image, and its pull would turn. Use a larger box, or shorter springs."
-        )
 
 
 def _check_sign(name: str, value: Any, why: str, any_sign: bool = False) -> None:

@@ -24,7 +24,8 @@ from .numerics import cast_inexact
 from .state import State
 from .status import Status
 from .topology.base import Topology, about_middle
-from .topology.periods import box_of
+from .topology.graph import triangle_corners
+from .topology.periods import box_of, same_box
 from .vector import Vector
 
 Free = Array | tuple[Array, ...] | None
@@ -125,6 +126,11 @@ class System(eqx.Module):
         other = getattr(effect, "net", None)
         if other is not None and (other.node_shape != self.net.node_shape or other.node_permutation != self.net.node_permutation):
             raise ValueError(f"{name} ({type(effect).__name__}) was built on another topology than the system.")
+        if other is not None and not same_box(box_of(other), box_of(self.net)):
+            raise ValueError(
+                f"{name} ({type(effect).__name__}) was built on a net with box = {box_of(other)}, but the system's net has "
+                f"{box_of(self.net)}. Some forces would act through the walls, and others not. Build all on one net."
+            )
         effect.with_box(box_of(self.net))  # refuses a box that is too small
         return effect
 
@@ -273,6 +279,9 @@ def lumped_mass(net: Topology, points: Any, density: Any, triangles: Any = None)
         points: (N, D) rest positions [m].
         density: one number.
         triangles: (T, 3) node numbers, or None for a density along springs.
+
+    Raises:
+        ValueError: a density that is not positive, points of another number, a triangle that names a node that does not exist.
     """
     density = as_inexact("density", density)
     positive("density", density, "A node without mass would get an infinite acceleration.")
@@ -280,7 +289,9 @@ def lumped_mass(net: Topology, points: Any, density: Any, triangles: Any = None)
         lengths = net.lengths(points)
         return net.flatten_nodes(net.incident_sum(net.split(0.5 * density * lengths)))
     points = as_inexact("points", about_middle(points))
-    corners = np.asarray(triangles)
+    if points.ndim != 2 or points.shape[0] != net.n_nodes:
+        raise ValueError(f"points has shape {points.shape}; expected ({net.n_nodes}, D): a position for each node.")
+    corners = triangle_corners(triangles, net.n_nodes)
     a, b, c = (points[corners[:, i]] for i in range(3))
     u, v = b - a, c - a
     squared = jnp.sum(u * u, axis=1) * jnp.sum(v * v, axis=1) - jnp.sum(u * v, axis=1) ** 2

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from .._checks import finite
-from .graph import Graph
+from .graph import Graph, triangle_corners
 from .reduction import Gather, Scatter
 
 Reductions = type[Gather] | type[Scatter] | None
@@ -38,12 +38,7 @@ def from_triangles(triangles: Any, n_nodes: int, *, reduction: Reductions = None
     >>> net.n_springs, net.triangles.shape
     (5, (2, 3))
     """
-    corners = np.asarray(triangles)
-    if corners.ndim != 2 or corners.shape[1] != 3 or not len(corners):
-        raise ValueError(f"triangles has shape {corners.shape}; expected (T, 3): three node numbers for each of T >= 1 triangles.")
-    if corners.dtype == np.bool_ or not np.issubdtype(corners.dtype, np.integer):
-        raise TypeError(f"triangles has dtype {corners.dtype}; expected integer node numbers.")
-    _check_corners(corners, n_nodes)
+    corners = triangle_corners(triangles, n_nodes)
     return Graph.from_edges(_sides(corners), n_nodes, triangles=corners, reduction=reduction)
 
 
@@ -221,18 +216,3 @@ def _sides(simplices: np.ndarray) -> np.ndarray:
     n = simplices.shape[1]
     sides = np.concatenate([simplices[:, [i, j]] for i in range(n) for j in range(i + 1, n)])
     return np.unique(np.sort(sides, axis=1), axis=0)
-
-
-def _check_corners(corners: np.ndarray, n_nodes: int) -> None:
-    bad = (corners < 0) | (corners >= n_nodes)
-    if bad.any():
-        row, column = (int(i) for i in np.argwhere(bad)[0])
-        raise ValueError(
-            f"triangles[{row}] = {tuple(corners[row].tolist())} names node {corners[row, column]}, but there are n_nodes = {n_nodes} "
-            f"(nodes are 0 to {n_nodes - 1}).\nUnchecked, JAX would read another node instead. Fix triangles[{row}]."
-        )
-    a, b, c = corners.T
-    same = (a == b) | (b == c) | (c == a)
-    if same.any():
-        row = int(np.argmax(same))
-        raise ValueError(f"triangles[{row}] = {tuple(corners[row].tolist())} has a corner twice: it is no triangle. Remove it.")

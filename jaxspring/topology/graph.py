@@ -59,7 +59,8 @@ class Graph(Topology):
                 None takes `Gather`, but `Scatter` on a CPU for more nodes than `FASTER_BY_SCATTER`.
 
         Raises:
-            ValueError: no node, a node that does not exist, a spring that joins a node to itself, a period that is negative or not finite.
+            ValueError: no node, a node that does not exist, a spring that joins a node to itself, a triangle with a corner twice, a period
+                that is negative or not finite.
             TypeError: node numbers that are not integers.
 
         >>> net = Graph.from_edges([(0, 1), (1, 2)], n_nodes=3)
@@ -81,7 +82,7 @@ class Graph(Topology):
             heads=jnp.asarray(heads),
             reduction=sums,
             box=as_box(box),
-            triangles=None if triangles is None else np.asarray(triangles, np.int32),
+            triangles=None if triangles is None else triangle_corners(triangles, n_nodes).astype(np.int32),
             count=int(n_nodes),
             nodes=nodes,
             springs=springs,
@@ -160,3 +161,25 @@ def _locality_order(pairs: np.ndarray, n_nodes: int) -> np.ndarray:
     both = np.concatenate([pairs, pairs[:, ::-1]])
     matrix = coo_array((np.ones(len(both), np.int8), (both[:, 0], both[:, 1])), shape=(n_nodes, n_nodes)).tocsr()
     return np.asarray(reverse_cuthill_mckee(matrix, symmetric_mode=True), np.int32)
+
+
+def triangle_corners(triangles: Any, n_nodes: int) -> np.ndarray:
+    """`triangles` as a (T, 3) integer array in which each names three different nodes 0 ... n_nodes - 1."""
+    corners = np.asarray(triangles)
+    if corners.ndim != 2 or corners.shape[1] != 3 or not len(corners):
+        raise ValueError(f"triangles has shape {corners.shape}; expected (T, 3): three node numbers for each of T >= 1 triangles.")
+    if corners.dtype == np.bool_ or not np.issubdtype(corners.dtype, np.integer):
+        raise TypeError(f"triangles has dtype {corners.dtype}; expected integer node numbers.")
+    bad = (corners < 0) | (corners >= n_nodes)
+    if bad.any():
+        row, column = (int(i) for i in np.argwhere(bad)[0])
+        raise ValueError(
+            f"triangles[{row}] = {tuple(corners[row].tolist())} names node {corners[row, column]}, but there are n_nodes = {n_nodes} "
+            f"(nodes are 0 to {n_nodes - 1}).\nUnchecked, JAX would read another node instead. Fix triangles[{row}]."
+        )
+    a, b, c = corners.T
+    same = (a == b) | (b == c) | (c == a)
+    if same.any():
+        row = int(np.argmax(same))
+        raise ValueError(f"triangles[{row}] = {tuple(corners[row].tolist())} has a corner twice: it is no triangle. Remove it.")
+    return corners

@@ -2,7 +2,7 @@
 
 A node field is an array of shape (n,), (ny, nx) or (nz, ny, nx). A spring family is one offset: its springs join every node `i`
 to node `i + offset`. Differences and sums on the nodes are shifted slices (see `shifts`), so no index is ever read. On a periodic
-axis the slice is a roll, and `box` (the period in each coordinate, [m]) takes the minimum image.
+axis the slice is a roll, and `box` (the period in each coordinate, [m]) takes the nearest image: see `periods`.
 """
 
 from __future__ import annotations

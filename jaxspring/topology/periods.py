@@ -105,6 +105,14 @@ def check_wrapped(shape: tuple[int, ...], wraps: tuple[bool, ...], box: Array | 
             )
 
 
+def same_box(one: Any, other: Any) -> bool:
+    """Whether two boxes have the same periods, as far as they are known; none is as periods of zero."""
+    if not all(is_concrete(box) for box in (one, other) if box is not None):
+        return True
+    a, b = (np.zeros(3) if box is None else np.pad(np.asarray(box, float), (0, 3 - len(box))) for box in (one, other))
+    return bool(np.allclose(a, b, rtol=1e-6, atol=0))
+
+
 def longest(box: Any) -> float:
     """Length [m] that no nearest image exceeds: half the diagonal of the box; infinite where a coordinate has no period."""
     if box is None or not is_concrete(box):
@@ -163,6 +171,7 @@ __all__ = [
     "longest",
     "minimum_image",
     "nearest_image",
+    "same_box",
     "turned",
     "turns_of",
 ]

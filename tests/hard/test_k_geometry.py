@@ -14,6 +14,11 @@ def free_net(n, box):
     return js.Graph.from_edges(np.zeros((0, 2), int), n, box=box)
 
 
+def joined(box):
+    """Two nodes and a spring in a box."""
+    return js.Graph.from_edges([(0, 1)], 2, box=box)
+
+
 def images(points, box):
     """(N, N, D) nearest images of the differences, in NumPy."""
     d = points[:, None] - points[None]
@@ -92,7 +97,7 @@ def test_the_grid_of_a_lattice_closes():
 @pytest.mark.parametrize("speed", [0.9, 1.5])
 def test_a_spring_beyond_half_a_period_is_told(speed, stepper):
     """A spring that swings by v sqrt(m / 2k) about 4 m in a box of 10 m: right and quiet below 5 m, BOX (an error) beyond."""
-    net = js.Graph.from_edges([(0, 1)], 2, box=[10.0])
+    net = joined([10.0])
     system = js.System(net, 1.0, js.Springs(net, 1.0, 4.0))
     state = js.State.from_points(net, [[0.0], [4.0]], [[-speed / 2], [speed / 2]])
     result = js.rollout(system, state, stepper, 0.01, 400)
@@ -316,3 +321,20 @@ def test_lengths_and_masses_far_from_the_origin_in_32_bits(offset, rng):
     system = js.System(net, 1.0, js.Springs(net, 1.0, net.lengths(far)))
     with pytest.warns(js.StabilityWarning, match="PRECISION"):
         js.rollout(system, js.State.from_points(net, far), js.VelocityVerlet(), 1e-3, 1)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: js.Graph.from_edges([(0, 1)], 2, triangles=[(0, 1, 2)]), r"triangles\[0\] = \(0, 1, 2\) names node 2"),
+        (lambda: js.lumped_mass(js.lattice((2, 2)), np.eye(4, 2), 1.0, [(0, 1, 3), (0, 1, 9)]), r"triangles\[1\] .* names node 9"),
+        (lambda: js.lumped_mass(js.lattice((2, 2)), np.eye(3, 2), 1.0, [(0, 1, 3)]), r"points has shape \(3, 2\); expected \(4, D\)"),
+        (lambda: js.System(joined([5.0]), 1.0, js.Springs(joined(None), 1.0)), r"box = None.*net has\s+\[5\.\]"),
+        (lambda: js.Image(np.ones((4, 4), np.float32), 1.0, origin=(5e6 + 0.25, 0.0)), r"origin along x .* 0\.25 pixels off"),
+        (lambda: js.delaunay(np.zeros((5, 1))), "A chain needs no triangulation"),
+    ],
+)
+def test_geometry_that_does_not_belong_together_is_refused(make, message):
+    """Triangles of nodes that do not exist, points of another net, two boxes, an image whose place is lost: named."""
+    with pytest.raises(ValueError, match=message):
+        make()

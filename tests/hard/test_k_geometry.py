@@ -151,13 +151,10 @@ def test_a_box_that_was_traced_is_told():
     found = jax.vmap(flags)(jnp.array([12.0, 4.5, -12.0]))
     assert [int(flag) & int(js.Flag.BOX) > 0 for flag in found] == [False, True, True]
 
-    def of_springs(box):
-        net = js.Graph.from_edges([(0, 1)], 2, box=box[None])
-        state = js.State.from_points(net, [[0.0], [1.0]])
-        return js.rollout(js.System(net, 1.0, js.Springs(net, 1.0, 1.0)), state, js.VelocityVerlet(), 1e-4, 1).status.flags
+    def is_invalid(box):
+        return js.Springs(joined(box[None]), 1.0, 1.0).invalid()
 
-    found = jax.vmap(of_springs)(jnp.array([12.0, -12.0, jnp.nan]))
-    assert [int(flag) & int(js.Flag.INVALID) > 0 for flag in found] == [False, True, True]
+    np.testing.assert_array_equal(jax.vmap(is_invalid)(jnp.array([12.0, -12.0, jnp.nan])), [False, True, True])
 
 
 def test_springs_in_some_coordinates_keep_their_periods():
@@ -180,7 +177,7 @@ def test_a_pair_through_the_wall():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("box", "n_gradients"), [([9.0], 2), ([5.2, 0.0], 1), ([5.5, 5.0, 8.4], 0)], ids=["chain", "strip", "block"])
+@pytest.mark.parametrize(("box", "n_gradients"), [([9.0], 2), ([5.2, 0.0], 0), ([5.5, 5.0, 8.4], 0)], ids=["chain", "strip", "block"])
 def test_a_fluid_in_a_box_is_the_sum_over_nearest_images(box, n_gradients, rng):
     """Force, energy and its derivatives by positions and box are NumPy's, with all pairs and with a list, in 1, 2 and 3 dimensions."""
     box = np.array(box)
@@ -223,7 +220,7 @@ def test_a_hot_fluid_crosses_the_walls(rng):
         start = system.energy(state)
         assert abs(system.energy(result.state).total - start.total) < 2e-3 * start.kinetic
         np.testing.assert_allclose(system.momentum(result.state), 0, atol=1e-10)
-    assert np.sum(np.floor(ends[0].points / box) != np.floor(points / box)) > 20
+    assert np.sum(np.floor(np.asarray(ends[0].points) / box) != np.floor(points / box)) > 20
     np.testing.assert_allclose(ends[1].points, ends[0].points, atol=1e-8)
     assert 2 <= int(ends[1].neighbours.rebuilds) <= 150
 

@@ -22,10 +22,10 @@ from ..state import State
 from ..status import Flag
 from ..topology.base import Topology
 from ..topology.edge_field import EdgeField, ZeroOutside
-from ..topology.periods import along_axes, box_of
+from ..topology.periods import box_of
 from ..vector import Vector
 from .base import Finding, Force, any_refused
-from .in_box import check_rest_length, long_springs, turned_springs
+from .in_box import along_axes, check_rest_length, long_springs, turned_springs
 from .laws import Hooke, Law, PowerLaw, spring_block, spring_energy, spring_pull
 from .linearisation import Linearisation
 

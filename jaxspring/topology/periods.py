@@ -3,15 +3,13 @@
     nearest image    d - L round(d / L)        L: the period [m]; a coordinate of period zero does not repeat
 
 Positions are never wrapped: a node may travel through any number of boxes, and differences take the nearest image. A spring (or a pair) of
-half a period has two images that are as near, and beyond it the other one is taken: its pull turns round. `half_period` and `turned` find
-such springs.
+half a period has two images that are as near, and beyond it the other one is taken: its pull turns round (see `forces.in_box`).
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -19,13 +17,6 @@ from jaxtyping import Array
 
 from .._checks import as_inexact, is_concrete
 from ..vector import Vector
-from .edge_field import EdgeField
-
-if TYPE_CHECKING:
-    from .base import Topology
-
-# A spring of this share of a period or more may have either image after the slightest motion.
-NEARLY_HALF = 0.499
 
 
 def nearest_image(d: Array, period: Array) -> Array:
@@ -121,57 +112,19 @@ def longest(box: Any) -> float:
     return float(np.linalg.norm(periods) / 2) if (periods > 0).all() else np.inf
 
 
-def half_period(net: Topology, d: EdgeField, alive: EdgeField | None) -> Array:
-    """How many springs are half a period long along a coordinate, or nearly so."""
-    box = box_of(net)
-
-    def of_family(d: Vector, counts: Any) -> Array:
-        long = jnp.zeros(d.shape, bool)
-        for along, period in zip(d, box, strict=True):
-            period = period.astype(along.dtype)
-            long = long | ((period > 0) & (jnp.abs(along) >= NEARLY_HALF * period))
-        return (long & counts).astype(jnp.int32)
-
-    return net.sum(net.map_springs(of_family, d, jnp.ones((), bool) if alive is None else alive))
-
-
-def turned(net: Topology, start: Vector, now: Vector, alive: EdgeField | None) -> Array:
-    """How many springs have another image than at the start: between the two they have been longer than half a period."""
-    box, plain = box_of(net), net.unboxed()
-
-    def of_family(before: Vector, after: Vector, counts: Any) -> Array:
-        is_other = jnp.zeros(after.shape, bool)
-        for a, b, period in zip(before, after, box, strict=True):
-            is_other = is_other | (turns_of(a, period) != turns_of(b, period))
-        return (is_other & counts).astype(jnp.int32)
-
-    fields = plain.difference(start), plain.difference(now), jnp.ones((), bool) if alive is None else alive
-    return net.sum(net.map_springs(of_family, *fields))
-
-
-def along_axes(net: Topology, axes: tuple[int, ...] | None) -> Topology:
-    """The net as differences of these coordinates alone see it: with their periods."""
-    if axes is None or box_of(net) is None:
-        return net
-    return eqx.tree_at(box_of, net, box_of(net)[np.asarray(axes)])
-
-
-def box_of(net: Topology) -> Any:
+def box_of(net: Any) -> Any:
     """(D,) periods of a net, or None."""
     return getattr(net, "box", None)
 
 
 __all__ = [
-    "along_axes",
     "as_box",
     "box_of",
     "check_dim",
     "check_wrapped",
-    "half_period",
     "longest",
     "minimum_image",
     "nearest_image",
     "same_box",
-    "turned",
     "turns_of",
 ]

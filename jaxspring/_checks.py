@@ -144,12 +144,10 @@ def node_indices(name: str, edges: Any, n_nodes: int) -> np.ndarray:
 
 
 def triangle_indices(name: str, triangles: Any, n_nodes: int) -> np.ndarray:
-    """`triangles` as a (T, 3) integer array of its own whose every entry names a node 0 ... n_nodes - 1."""
+    """`triangles` as a (T, 3) integer array of its own in which each names three different nodes 0 ... n_nodes - 1."""
     array = as_indices(name, triangles)
-    if array.size == 0:
-        return np.zeros((0, 3), np.int32)
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise ValueError(f"{name} has shape {array.shape}; expected (T, 3): three node numbers for each triangle.")
+    if array.ndim != 2 or array.shape[1] != 3 or not len(array):
+        raise ValueError(f"{name} has shape {array.shape}; expected (T, 3): three node numbers for each of T >= 1 triangles.")
     bad = (array < 0) | (array >= n_nodes)
     if bad.any():
         row, column = (int(i) for i in np.argwhere(bad)[0])
@@ -157,6 +155,11 @@ def triangle_indices(name: str, triangles: Any, n_nodes: int) -> np.ndarray:
             f"{name}[{row}] = {tuple(array[row].tolist())} names node {array[row, column]}, but there are n_nodes = {n_nodes} "
             f"(nodes are 0 to {n_nodes - 1}).\nUnchecked, JAX would read another node instead. Fix {name}[{row}]."
         )
+    a, b, c = array.T
+    same = (a == b) | (b == c) | (c == a)
+    if same.any():
+        row = int(np.argmax(same))
+        raise ValueError(f"{name}[{row}] = {tuple(array[row].tolist())} has a corner twice: it is no triangle. Remove it.")
     return array.astype(np.int32)
 
 

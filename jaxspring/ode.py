@@ -212,7 +212,7 @@ def _solve(
     last = _as_state(times[0], jax.tree.map(lambda a: a[0], frames), _Scene(ready, start))
     names = ("num_steps", "num_accepted_steps", "num_rejected_steps")
     n_steps, n_accepted, n_rejected = (jnp.asarray(found.stats[name], jnp.int32) for name in names)
-    status = before.then(look(ready, Carry(last, None, n_steps))).then(_verdict(solution.result, n_steps))
+    status = before.then(look(ready, Carry(last, None, n_steps), start)).then(_verdict(solution.result, n_steps))
     return OdeResult(
         state=last,
         saved=None if saveat is None else found.ys[0],

@@ -233,7 +233,7 @@ def _proceed(begun: _Begun, job: _Job, progress: Progress | None = None) -> Resu
             jax.debug.callback(partial(progress.update, total=job.plan.n_steps), carry.step - resume.step)
 
     first = stopped(carry)
-    advance, look = partial(_advance, ready, job.stepper, clock), partial(inspect, ready, begun.precise)
+    advance, look = partial(_advance, ready, job.stepper, clock), partial(inspect, ready, begun.precise, begun.state)
     (carry, status), frames = run_blocks(advance, look, job.keep, report, (carry, begun.status), job.plan)
     saved, solves_saved = (None, None) if frames is None else frames
     if carry.solves is None:

@@ -42,6 +42,7 @@ class Flag(enum.IntFlag):
     UNSTABLE = 131072
     UNDETERMINED = 262144
     IMPACTS = 524288
+    BOX = 1048576
 
 
 WARNINGS = Flag.COINCIDENT | Flag.OVERLAP | Flag.OUTSIDE | Flag.DT_LIMIT | Flag.PRECISION | Flag.UNDETERMINED | Flag.IMPACTS
@@ -62,11 +63,13 @@ EXPLANATION = {
     Flag.MAX_STEPS: "the adaptive solver ran out of steps; raise max_steps or loosen the tolerance",
     Flag.INTERRUPTED: "interrupted; the result holds what was done until then",
     Flag.DT_LIMIT: "dt is too long: above the stability limit (see stable_dt), or for particles that move or meet so fast",
-    Flag.PRECISION: "rounding of such large coordinates spoils the springs' forces; move the scene to the origin, or use float64",
+    Flag.PRECISION: "rounding of such large coordinates spoils the forces; move the scene to the origin, or use float64",
     Flag.SOLVER: "the solver gave up: its solve did not reach the accuracy it needs, or its step shrank to the least allowed",
     Flag.UNSTABLE: "the forces balance, but the shape is no minimum of the energy: a small push makes it buckle; start from one",
     Flag.UNDETERMINED: "the data leave some of the parameters open; fix or tie them, or add data",
     Flag.IMPACTS: "a node met more obstacles in one step than are followed, and waited at the last one; lower dt",
+    Flag.BOX: "the box is too small: a spring has reached half a period, where its pull turns to another image of its node, or a fluid's "
+    "cut-off is beyond it; use a larger box, shorter springs or cut-off",
     Flag.INVALID: "a parameter has a value that its constructor would refuse (sign, NaN or infinity)",
 }
 

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ._arrays import as_mask, kept
-from ._checks import as_inexact, finite, has_shape, positive, shape_of, triangle_indices
+from ._checks import as_inexact, has_shape, positive, shape_of
 from .forces.base import Force, Rule, Step
 from .forces.contact import strike
 from .forces.linearisation import Linearisation
@@ -28,6 +28,7 @@ from .pickling import refuse_local_functions
 from .state import State
 from .status import Status
 from .topology.base import Topology
+from .topology.periods import box_of, same_box
 from .vector import Vector
 
 Free = Array | tuple[Array, ...] | None
@@ -127,7 +128,8 @@ class System(eqx.Module):
 
     def _cast(self, effect: Force, state: State) -> Force:
         """The effect in its system, and constants of the state's dtype: float32 in, float32 out, whatever the constants were."""
-        return cast_inexact(effect.with_mass(self.mass).with_forces(self.forces), self._taken(state).dtype)
+        inside = effect.with_box(box_of(self.net)).with_mass(self.mass).with_forces(self.forces)
+        return cast_inexact(inside, self._taken(state).dtype)
 
     def _taken(self, state: State) -> State:
         """The state, where this is one system and that one state, which JAX can compute."""
@@ -159,6 +161,12 @@ class System(eqx.Module):
         other = getattr(effect, "net", None)
         if other is not None and (other.node_shape != self.net.node_shape or other.node_permutation != self.net.node_permutation):
             raise ValueError(f"{name} ({type(effect).__name__}) was built on another topology than the system.")
+        if other is not None and not same_box(box_of(other), box_of(self.net)):
+            raise ValueError(
+                f"{name} ({type(effect).__name__}) was built on a net with box = {box_of(other)}, but the system's net has "
+                f"{box_of(self.net)}. Some forces would act through the walls, and others not. Build all on one net."
+            )
+        effect.with_box(box_of(self.net))  # refuses a box that is too small
         return effect
 
     def _owning(self, state: State) -> State:
@@ -226,11 +234,12 @@ class System(eqx.Module):
     def prepare(self, dtype: Any) -> System:
         """The system as a loop wants it: every constant in the shape of the topology and of `dtype`."""
         self._refuse_stack()
-        alone = tuple(f.with_mass(self.mass).prepare(dtype) for f in self.forces)
+        box = box_of(self.net)
+        alone = tuple(f.with_box(box).with_mass(self.mass).prepare(dtype) for f in self.forces)
         forces = tuple(f.with_forces(alone) for f in alone)
         ready = eqx.tree_at(lambda s: s.forces, self, forces)
         if self.rules:
-            rules = tuple(r.with_mass(self.mass).with_forces(forces).prepare(dtype) for r in self.rules)
+            rules = tuple(r.with_box(box).with_mass(self.mass).with_forces(forces).prepare(dtype) for r in self.rules)
             ready = eqx.tree_at(lambda s: s.rules, ready, rules)
         return cast_inexact(ready, dtype)
 
@@ -359,36 +368,6 @@ def _reads_velocity(force: Force, state: State) -> bool:
 
 def _sum_blocks(parts: Iterable[Blocks | None]) -> Blocks:
     return sum((part for part in parts if part is not None), start=Blocks())
-
-
-def lumped_mass(net: Topology, points: Any, density: Any, triangles: Any = None) -> Array:
-    """(N,) node masses [kg] from a density, in the user's order.
-
-    Along springs (density [kg/m]) each spring gives half its mass to either end. With triangles (density [kg/m^2]) each triangle gives
-    a third to each corner.
-
-    Args:
-        net: the topology.
-        points: (N, D) rest positions [m].
-        density: one number.
-        triangles: (T, 3) node numbers, or None for a density along springs.
-    """
-    points = as_inexact("points", points)
-    density = as_inexact("density", density, points.dtype)
-    has_shape("density", density, {"one number": ()})
-    positive("density", density, "A node without mass would get an infinite acceleration.")
-    if points.ndim != 2 or points.shape[0] != net.n_nodes:
-        raise ValueError(f"points has shape {points.shape}; expected ({net.n_nodes}, D).")
-    finite("points", points)
-    if triangles is None:
-        lengths = net.lengths(points)
-        return net.flatten_nodes(net.incident_sum(net.split(0.5 * density * lengths)))
-    corners = triangle_indices("triangles", triangles, net.n_nodes)
-    a, b, c = (points[corners[:, i]] for i in range(3))
-    u, v = b - a, c - a
-    squared = jnp.sum(u * u, axis=1) * jnp.sum(v * v, axis=1) - jnp.sum(u * v, axis=1) ** 2
-    share = density * jnp.sqrt(jnp.maximum(squared, jnp.zeros((), squared.dtype))) / 6
-    return jnp.zeros(net.n_nodes, points.dtype).at[corners.ravel()].add(jnp.repeat(share, 3))
 
 
 def _as_free(net: Topology, free: Any) -> Free:

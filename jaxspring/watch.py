@@ -135,19 +135,19 @@ def begin(system: System, ready: System, precise: Precision, carry: Carry, dt: A
     return lax.stop_gradient(status)
 
 
-def inspect(system: System, precise: Precision, after: Carry, status: Status) -> Status:
-    """The status brought up to date at the end of a block."""
-    return status.then(look(system, after)).then(precise.look(system, after))
+def inspect(system: System, precise: Precision, start: State, after: Carry, status: Status) -> Status:
+    """The status brought up to date at the end of a block of a run from `start`."""
+    return status.then(look(system, after, start)).then(precise.look(system, after))
 
 
-def look(system: System, carry: Carry) -> Status:
-    """Status of one state: is it finite, and what the effects have to report."""
-    system, state = stopped((system, carry.state))
+def look(system: System, carry: Carry, start: State | None = None) -> Status:
+    """Status of one state: is it finite, and what the effects have to report, also since `start`."""
+    system, state, start = stopped((system, carry.state, start))
     bad = _nonfinite(state)
     node = jnp.argmax(jnp.ravel(bad))
     status = Status.when(Flag.NONFINITE, jnp.any(bad), step=carry.step, node=node, count=jnp.sum(bad))
     for i, effect in enumerate(system.parts):
-        for found in effect.diagnose(state):
+        for found in (*effect.diagnose(state), *(() if start is None else effect.diagnose_since(start, state))):
             raised = Status.when(found.flag, found.count > 0, step=carry.step, node=found.node, effect=i, count=found.count)
             status = status.then(raised)
     return status

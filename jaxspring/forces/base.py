@@ -95,12 +95,22 @@ class Rule(eqx.Module):
         """The same, knowing the node masses [kg]; only what needs them answers with another object."""
         return self
 
+    def with_box(self, box: Array | None) -> Self:
+        """The same, knowing the periods [m] of the system's coordinates (None: there are none), which it must fit; only what takes
+        differences without a net needs them.
+        """
+        return self
+
     def with_forces(self, forces: tuple[Force, ...]) -> Self:
         """The same, knowing all forces of its system; only what needs them answers with another object."""
         return self
 
     def diagnose(self, state: State) -> tuple[Finding, ...]:
         """What this effect has to report about a state: see `Finding`."""
+        return ()
+
+    def diagnose_since(self, start: State, state: State) -> tuple[Finding, ...]:
+        """What it has to report about a state that a run has brought from `start`, besides `diagnose`."""
         return ()
 
     def invalid(self) -> Array | None:

@@ -24,6 +24,7 @@ from ..topology.base import Topology
 from ..topology.edge_field import EdgeField
 from ..vector import Vector
 from .base import Finding, Force, any_refused
+from .in_box import long_springs, turned_springs
 from .laws import has_no_direction, is_beyond_range
 from .living import counted, living, map_living
 from .springs import _check_sign, _edge_constant
@@ -125,7 +126,7 @@ class Dashpots(Force):
 
     def diagnose(self, state: State) -> tuple[Finding, ...]:
         """COINCIDENT: dampers whose ends are apart, but so near that the square of their distance underflows: they have no direction
-        then. NONFINITE: dampers so long that it overflows.
+        then. NONFINITE: dampers so long that it overflows. BOX: dampers of half a period.
         """
         if self.net.n_springs == 0:
             return ()
@@ -139,7 +140,14 @@ class Dashpots(Force):
 
         d, nowhere = self.net.difference(state.position), jnp.asarray(-1, jnp.int32)
         counts = (self.net.sum(map_living(self.net, state, of_family, d)) for of_family in (near, far))
-        return tuple(Finding(flag, n, nowhere) for flag, n in zip((Flag.COINCIDENT, Flag.NONFINITE), counts, strict=True))
+        found = (Finding(flag, n, nowhere) for flag, n in zip((Flag.COINCIDENT, Flag.NONFINITE), counts, strict=True))
+        return (*found, *long_springs(self.net, state.position, living(self.net, state)))
+
+    def diagnose_since(self, start: State, state: State) -> tuple[Finding, ...]:
+        """BOX: dampers that act toward another image than at the start."""
+        if self.net.n_springs == 0:
+            return ()
+        return turned_springs(self.net, start.position, state.position, living(self.net, state))
 
     def can_feed(self, state: State) -> bool:
         """No: a damper takes energy out."""

@@ -96,6 +96,10 @@ class DataSprings(Force):
         """OUTSIDE: nodes beyond the image's border."""
         return _outside(_surface(self), state)
 
+    def rounding(self, state: State) -> Array:
+        """The largest coordinate's rounding over the distance of two pixels."""
+        return _rounding(_surface(self), state)
+
     def invalid(self) -> Array:
         """Whether the stiffness is negative or not finite, or the image's spacing not positive."""
         return any_refused(self.stiffness) | any_not_positive(self.image.spacing)
@@ -135,6 +139,10 @@ class ImageAttraction(Force):
         """-strength d, summed [J]."""
         return -jnp.sum(self.strength * _surface(self).value(state.position[0], state.position[1]))
 
+    def rounding(self, state: State) -> Array:
+        """The largest coordinate's rounding over the distance of two pixels."""
+        return _rounding(_surface(self), state)
+
     def diagnose(self, state: State) -> tuple[Finding, ...]:
         """OUTSIDE: nodes beyond the image's border."""
         return _outside(_surface(self), state)
@@ -163,3 +171,9 @@ def _outside(image: Surface, state: State) -> tuple[Finding, ...]:
     beyond = image.outside(state.position[0], state.position[1])
     node = jnp.argmax(jnp.ravel(beyond)).astype(jnp.int32)
     return (Finding(Flag.OUTSIDE, jnp.sum(beyond).astype(jnp.int32), node),)
+
+
+def _rounding(image: Surface, state: State) -> Array:
+    eps = jnp.asarray(jnp.finfo(state.dtype).eps, state.dtype)
+    errors = [jnp.max(jnp.abs(state.position[i])) * eps / image.spacing[i].astype(state.dtype) for i in range(2)]
+    return jnp.maximum(errors[0], errors[1])

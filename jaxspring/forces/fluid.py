@@ -16,6 +16,7 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array
 
@@ -24,6 +25,7 @@ from ..numerics import any_lane, stopped
 from ..state import State
 from ..status import Flag, Status
 from ..topology.base import Topology
+from ..topology.periods import check_dim
 from ..vector import Vector
 from .base import Finding, Force, Step, any_not_positive
 from .cutoffs import Cutoff, NoCutoff
@@ -49,6 +51,7 @@ class Fluid(Force):
             equilibrium distance unless said.
         molten: `Molten(net)`: only particles without a living spring are fluid; None: all are.
         mass: [kg]; `System` fills it in.
+        box: (D,) period of each coordinate [m], or None; `System` fills it in from its net. Each pair acts by its nearest image alone.
 
     Raises:
         TypeError: a law, cut-off, pairs, drag or molten of another kind.
@@ -68,6 +71,7 @@ class Fluid(Force):
     core: Array
     molten: Molten | None
     mass: Array | None
+    box: Array | None
 
     def __init__(
         self,
@@ -85,7 +89,7 @@ class Fluid(Force):
         why = "Two particles at one place would have an infinite force."
         self.core = CORE_FRACTION * law.equilibrium_distance if core is None else constant("core", core, why)
         self.molten = None if molten is None else kind("molten", molten, Molten, "Molten(net)")
-        self.mass = None
+        self.mass = self.box = None
         self._check()
 
     @property
@@ -101,6 +105,23 @@ class Fluid(Force):
     def with_mass(self, mass: Array) -> Fluid:
         """The same fluid of these masses [kg]."""
         return eqx.tree_at(lambda f: f.mass, self, mass, is_leaf=lambda leaf: leaf is None)
+
+    def with_box(self, box: Array | None) -> Fluid:
+        """The same fluid in a box of these periods.
+
+        Raises:
+            ValueError: a cut-off, or a radius of the drag, beyond half a period.
+        """
+        if box is None:
+            return self
+        for name, value in self._within_half().items():
+            if is_concrete(value) and is_concrete(box) and bool(jnp.any(_is_beyond_half(value, box))):
+                most = float(np.min(np.asarray(box)[np.asarray(box) > 0])) / 2
+                raise ValueError(
+                    f"{name} = {value} m is beyond half a period of box = {np.asarray(box)} m: a particle would reach two images of "
+                    f"another, of which one acts. Use a larger box, or a {name} of at most {most:.9g} m."
+                )
+        return eqx.tree_at(lambda f: f.box, self, box, is_leaf=lambda leaf: leaf is None)
 
     def with_forces(self, forces: tuple[Force, ...]) -> Fluid:
         """The same; refuses a second list, for which a state has no place.
@@ -139,20 +160,32 @@ class Fluid(Force):
         return None if self.drag is None else self._sum(state, PairTerms.damping, 1)[0]
 
     def diagnose(self, state: State) -> tuple[Finding, ...]:
-        """OVERLAP: pairs closer than the core, with the first node of one; NEIGHBOUR_OVERFLOW with the capacity that is needed."""
+        """OVERLAP: pairs closer than the core, with the first node of one; NEIGHBOUR_OVERFLOW with the capacity that is needed; BOX where
+        a cut-off is beyond half a period.
+        """
         count = self._sum(state, PairTerms.overlap, 1)[0]
         pairs = jnp.round(jnp.sum(count) / 2).astype(jnp.int32)
         findings = (Finding(Flag.OVERLAP, pairs, jnp.argmax(jnp.ravel(count) > 0).astype(jnp.int32)),)
         needed = self.pairs.needed(state.neighbours)
         nowhere = jnp.asarray(-1, jnp.int32)
+        if self.box is not None:
+            bad = jnp.any(~(self.box >= 0))
+            for value in self._within_half().values():
+                bad = bad | jnp.any(_is_beyond_half(value, self.box))
+            findings = (*findings, Finding(Flag.BOX, bad.astype(jnp.int32), nowhere))
         return findings if needed is None else (Finding(Flag.NEIGHBOUR_OVERFLOW, needed, nowhere), *findings)
+
+    def rounding(self, state: State) -> Array:
+        """The largest coordinate's rounding over the equilibrium distance."""
+        largest = jnp.max(jnp.stack([jnp.max(jnp.abs(a)) for a in state.position]))
+        return largest * jnp.asarray(jnp.finfo(state.dtype).eps, state.dtype) / self.law.equilibrium_distance.astype(state.dtype)
 
     def begin(self, state: State) -> State:
         """The state with the list that its pairs reuse: its own where it serves, else a new one."""
         position, reach = stopped(self._flat(state)), self.cutoff.reach
         if state.neighbours is None:
-            return replace(state, neighbours=self.pairs.begin(position, reach))
-        return replace(state, neighbours=self.pairs.keep(state.neighbours, position, reach))
+            return replace(state, neighbours=self.pairs.begin(position, reach, *self._periods))
+        return replace(state, neighbours=self.pairs.keep(state.neighbours, position, reach, *self._periods))
 
     def update(self, step: Step, state: State) -> tuple[State, Status]:
         """The list brought up to date, and DT_LIMIT where dt is too long for two of the fastest particles that meet head-on."""
@@ -166,7 +199,7 @@ class Fluid(Force):
         """The list after a step; left as it is while nothing is fluid."""
 
         def updated() -> tuple[Any, Status]:
-            return self.pairs.update(state.neighbours, self._flat(before), self._flat(state), self.cutoff.reach)
+            return self.pairs.update(state.neighbours, self._flat(before), self._flat(state), self.cutoff.reach, *self._periods)
 
         if self.molten is None or state.neighbours is None:
             return updated()
@@ -204,6 +237,16 @@ class Fluid(Force):
             inner["drag.radius"] = self.drag.radius
         return inner
 
+    @property
+    def _periods(self) -> tuple[Array, ...]:
+        """What `Pairs` get besides positions and reach: nothing in a space without periods."""
+        return () if self.box is None else (self.box,)
+
+    def _within_half(self) -> dict[str, Array]:
+        """Distances [m] that must not be beyond half a period."""
+        outer = {} if self.cutoff.reach is None else {"cut-off": self.cutoff.reach}
+        return outer if self.drag is None else {**outer, "drag.radius": self.drag.radius}
+
     def _check(self) -> None:
         reach = self.cutoff.reach
         if reach is None:
@@ -218,6 +261,7 @@ class Fluid(Force):
 
     def _sum(self, state: State, term: Callable[..., Fields], n: int, with_velocity: bool = False) -> Fields:
         """Sum of a pair term at each node, `n` arrays in node shape; zeros while nothing is fluid."""
+        check_dim(self.box, state.dim)
         shape = state.position.shape
         fluid = None if self.molten is None else self.molten.is_fluid(state)
         particles = Particles(
@@ -226,7 +270,7 @@ class Fluid(Force):
             fluid=None if fluid is None else jnp.ravel(fluid).astype(state.dtype),
             velocity=tuple(jnp.ravel(a) for a in state.velocity) if with_velocity else (),
         )
-        memory = self.pairs.ready(state.neighbours, stopped(particles.position), self.cutoff.reach)
+        memory = self.pairs.ready(state.neighbours, stopped(particles.position), self.cutoff.reach, *self._periods)
 
         def summed(operands: tuple[Particles, PairTerms, Any]) -> Fields:
             particles, terms, memory = operands
@@ -235,7 +279,7 @@ class Fluid(Force):
         def nothing(operands: tuple[Particles, PairTerms, Any]) -> Fields:
             return (jnp.zeros(particles.position[0].shape, state.dtype),) * n
 
-        terms = PairTerms(self.law, self.cutoff, self.core, self.drag, particles.arrangement)
+        terms = PairTerms(self.law, self.cutoff, self.core, self.drag, particles.arrangement, self.box)
         operands = (particles, terms, memory)
         flat = summed(operands) if fluid is None else lax.cond(any_lane(jnp.any(fluid)), summed, nothing, operands)
         return tuple(a.reshape(shape) for a in flat)
@@ -253,3 +297,8 @@ def _is_beyond(distance: Array, reach: Array) -> Array:
     """Whether a distance is beyond the reach; a cut-off at the distance itself is not, whatever its rounding."""
     coarser = max(float(jnp.finfo(value.dtype).eps) for value in (distance, reach))
     return distance > reach.astype(distance.dtype) * (1 + 8 * coarser)
+
+
+def _is_beyond_half(distance: Array, box: Array) -> Array:
+    """(D,) whether a distance is beyond half of each period."""
+    return (box > 0) & _is_beyond(distance, box / 2)

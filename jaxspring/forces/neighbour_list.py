@@ -26,7 +26,7 @@ from .._checks import constant
 from ..numerics import any_lane
 from ..status import Flag, Status
 from .cells import Neighbourhood, find_neighbours
-from .pair_sums import Fields
+from .pair_sums import Fields, difference, squared_length
 from .pairs import AllPairs, PairFunction, Pairs
 
 # Neighbours taken at a time: fewer write the sums more often; more make loops that XLA shares between cores though they are short.
@@ -41,16 +41,19 @@ class NeighbourMemory(eqx.Module):
         reference: D arrays (N,) of positions [m] when it was made.
         edge: distance [m] below which pairs are listed.
         rebuilds: how often it was made anew.
+        box: (D,) periods [m] for which it was made, or None.
     """
 
     near: Neighbourhood
     reference: Fields
     edge: Array
     rebuilds: Array
+    box: Array | None = None
 
-    def serves(self, position: Fields, reach: Array) -> Array:
+    def serves(self, position: Fields, reach: Array, box: Array | None = None) -> Array:
         """Whether every pair nearer than `reach` [m] at these positions is sure to be listed, room allowing."""
-        return 2 * _farthest(self.reference, position) <= self.edge - reach.astype(self.edge.dtype)
+        is_near = 2 * _farthest(self.reference, position, box) <= self.edge - reach.astype(self.edge.dtype)
+        return is_near if box is None or self.box is None else is_near & jnp.all(self.box == box.astype(self.box.dtype))
 
 
 class TrustedList(eqx.Module):
@@ -90,27 +93,29 @@ class NeighbourList(Pairs):
         """Yes."""
         return True
 
-    def begin(self, position: Fields, reach: Array | None) -> NeighbourMemory:
+    def begin(self, position: Fields, reach: Array | None, box: Array | None = None) -> NeighbourMemory:
         """A list for these positions."""
-        return self._made(position, reach, jnp.zeros((), jnp.int32))
+        return self._made(position, reach, jnp.zeros((), jnp.int32), box)
 
-    def keep(self, memory: NeighbourMemory, position: Fields, reach: Array | None) -> NeighbourMemory:
+    def keep(self, memory: NeighbourMemory, position: Fields, reach: Array | None, box: Array | None = None) -> NeighbourMemory:
         """The list where it serves these positions, else a new one."""
-        fresh = jax.eval_shape(lambda: self.begin(position, reach))
+        fresh = jax.eval_shape(lambda: self.begin(position, reach, box))
         if jax.tree.structure(fresh) != jax.tree.structure(memory) or any(
             a.shape != b.shape or a.dtype != b.dtype for a, b in zip(jax.tree.leaves(fresh), jax.tree.leaves(memory), strict=True)
         ):
-            return self.begin(position, reach)
-        is_good = (memory.edge == self._edge(position, reach)) & memory.serves(position, _given(reach))
-        return lax.cond(any_lane(~is_good), lambda _: self.begin(position, reach), lambda memory: memory, memory)
+            return self.begin(position, reach, box)
+        is_good = (memory.edge == self._edge(position, reach)) & memory.serves(position, _given(reach), box)
+        return lax.cond(any_lane(~is_good), lambda _: self.begin(position, reach, box), lambda memory: memory, memory)
 
-    def update(self, memory: NeighbourMemory, before: Fields, position: Fields, reach: Array | None) -> tuple[NeighbourMemory, Status]:
+    def update(
+        self, memory: NeighbourMemory, before: Fields, position: Fields, reach: Array | None, box: Array | None = None
+    ) -> tuple[NeighbourMemory, Status]:
         """The list as it is, or made anew where a particle has moved far; DT_LIMIT where one step went farther than half the skin."""
-        step, moved = _farthest(before, position), _farthest(memory.reference, position)
+        step, moved = _farthest(before, position, box), _farthest(memory.reference, position, box)
         is_stale = any_lane(2 * step + moved > self.skin / 2)
 
         def anew(memory: NeighbourMemory) -> NeighbourMemory:
-            return self._made(position, reach, memory.rebuilds + 1)
+            return self._made(position, reach, memory.rebuilds + 1, box)
 
         fresh = lax.cond(is_stale, anew, lambda memory: memory, memory)
         needed = fresh.near.needed
@@ -123,10 +128,10 @@ class NeighbourList(Pairs):
             return jnp.zeros((), jnp.int32)
         return jnp.where(memory.near.needed > memory.near.table.shape[0], memory.near.needed, 0)
 
-    def ready(self, memory: NeighbourMemory | None, position: Fields, reach: Array | None) -> TrustedList:
+    def ready(self, memory: NeighbourMemory | None, position: Fields, reach: Array | None, box: Array | None = None) -> TrustedList:
         """The list, and whether it can be trusted at these positions; a new one where there is none."""
-        memory = self.begin(position, reach) if memory is None else memory
-        is_trusted = memory.serves(position, _given(reach)) & (self.needed(memory) == 0)
+        memory = self.begin(position, reach, box) if memory is None else memory
+        is_trusted = memory.serves(position, _given(reach), box) & (self.needed(memory) == 0)
         return TrustedList(memory.near, is_trusted, len(position))
 
     def visit(self, function: PairFunction, fields: Fields, memory: TrustedList) -> Fields:
@@ -139,9 +144,10 @@ class NeighbourList(Pairs):
             memory.near,
         )
 
-    def _made(self, position: Fields, reach: Array | None, rebuilds: Array) -> NeighbourMemory:
+    def _made(self, position: Fields, reach: Array | None, rebuilds: Array, box: Array | None) -> NeighbourMemory:
         edge = self._edge(position, reach)
-        return NeighbourMemory(find_neighbours(position, edge, self.capacity), position, edge, rebuilds)
+        periods = None if box is None else lax.stop_gradient(box.astype(edge.dtype))
+        return NeighbourMemory(find_neighbours(position, edge, self.capacity, periods), position, edge, rebuilds, periods)
 
     def _edge(self, position: Fields, reach: Array | None) -> Array:
         dtype = position[0].dtype
@@ -194,7 +200,6 @@ def _packed(fields: Fields, dim: int) -> Array:
     return jnp.concatenate([near, jnp.asarray([far] * dim + [0] * (width - dim), dtype)[None]])
 
 
-def _farthest(a: Fields, b: Fields) -> Array:
+def _farthest(a: Fields, b: Fields, box: Array | None) -> Array:
     """Largest distance between two sets of positions [m]."""
-    squared = sum(((p - q) * (p - q) for p, q in zip(a, b, strict=True)), start=jnp.zeros_like(a[0]))
-    return jnp.sqrt(jnp.max(squared, initial=0))
+    return jnp.sqrt(jnp.max(squared_length(difference(a, b, box)), initial=0))

@@ -20,9 +20,24 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..numerics import linear_call
+from ..topology.periods import nearest_image
 
 # One array per coordinate or quantity.
 Fields = tuple[Array, ...]
+
+
+def difference(a: Fields, b: Fields, box: Array | None) -> Fields:
+    """Per coordinate a - b, or its nearest image in a box of these periods."""
+    d = tuple(p - q for p, q in zip(a, b, strict=True))
+    return d if box is None else tuple(nearest_image(along, period) for along, period in zip(d, box, strict=True))
+
+
+def squared_length(d: Fields) -> Array:
+    """Sum of the squares of the coordinates."""
+    squared = d[0] * d[0]
+    for along in d[1:]:
+        squared = squared + along * along
+    return squared
 
 
 @eqx.filter_custom_jvp

@@ -20,7 +20,7 @@ from jaxtyping import Array
 from .cutoffs import Cutoff
 from .pair_drag import PairDrag
 from .pair_laws import PairLaw
-from .pair_sums import Fields
+from .pair_sums import Fields, difference, squared_length
 
 
 class Arrangement(eqx.Module):
@@ -79,6 +79,7 @@ class PairTerms(eqx.Module):
         core: distance [m] below which the force stops growing.
         drag: of the pair, or None.
         arrangement: tells how fields stand in the tuples.
+        box: (D,) period of each coordinate [m], or None: each pair acts by its nearest image.
     """
 
     law: PairLaw
@@ -86,11 +87,12 @@ class PairTerms(eqx.Module):
     core: Array
     drag: PairDrag | None
     arrangement: Arrangement
+    box: Array | None = None
 
     def force(self, own: Fields, other: Fields, distinct: Array | None) -> Fields:
         """Force on the own particle [N], one array per coordinate."""
         a, b = self.arrangement.particles(own), self.arrangement.particles(other)
-        d, squared = _difference(a, b)
+        d, squared = self._difference(a, b)
         guarded = jnp.maximum(squared, self.core * self.core)
         weight = self._shared(a, b, lambda: self.cutoff.weight(self.law, guarded), lambda: self._repulsion(guarded))
         if self.drag is not None and a.velocity:
@@ -103,7 +105,7 @@ class PairTerms(eqx.Module):
     def energy(self, own: Fields, other: Fields, distinct: Array | None) -> Fields:
         """Half the potential [J]: the other end counts the other half."""
         a, b = self.arrangement.particles(own), self.arrangement.particles(other)
-        _, squared = _difference(a, b)
+        _, squared = self._difference(a, b)
         guarded = jnp.maximum(squared, self.core * self.core)
         inner = (guarded - squared) / 2
 
@@ -120,7 +122,7 @@ class PairTerms(eqx.Module):
     def stiffness(self, own: Fields, other: Fields, distinct: Array | None) -> Fields:
         """Twice the largest eigenvalue of -dF/dx of the pair [N/m], zero where none is positive."""
         a, b = self.arrangement.particles(own), self.arrangement.particles(other)
-        _, squared = _difference(a, b)
+        _, squared = self._difference(a, b)
         r = jnp.sqrt(jnp.maximum(squared, self.core * self.core))
         zero = jnp.zeros((), r.dtype)
 
@@ -136,16 +138,21 @@ class PairTerms(eqx.Module):
     def damping(self, own: Fields, other: Fields, distinct: Array | None) -> Fields:
         """Twice the drag coefficient of the pair [N s/m]."""
         a, b = self.arrangement.particles(own), self.arrangement.particles(other)
-        _, squared = _difference(a, b)
+        _, squared = self._difference(a, b)
         rate = jnp.zeros_like(squared) if self.drag is None else self.drag.rate(jnp.maximum(squared, self.core * self.core))
         return (_if_distinct(distinct, 2 * self._takes_part(a, b, rate)),)
 
     def overlap(self, own: Fields, other: Fields, distinct: Array | None) -> Fields:
         """One where the pair is closer than the core."""
         a, b = self.arrangement.particles(own), self.arrangement.particles(other)
-        _, squared = _difference(a, b)
+        _, squared = self._difference(a, b)
         close = (squared < self.core * self.core).astype(squared.dtype)
         return (_if_distinct(distinct, self._takes_part(a, b, close)),)
+
+    def _difference(self, a: Particles, b: Particles) -> tuple[Fields, Array]:
+        """Own minus other position, and its square."""
+        d = difference(a.position, b.position, self.box)
+        return d, squared_length(d)
 
     def _repulsion(self, squared: Array) -> Array:
         return jnp.maximum(self.law.weight(squared), jnp.zeros((), squared.dtype))
@@ -163,15 +170,6 @@ class PairTerms(eqx.Module):
         if a.fluid is None or b.fluid is None:
             return value
         return jnp.where(a.fluid + b.fluid > 0.5, value, jnp.zeros((), value.dtype))
-
-
-def _difference(a: Particles, b: Particles) -> tuple[Fields, Array]:
-    """Own minus other position, and its square."""
-    d = tuple(p - q for p, q in zip(a.position, b.position, strict=True))
-    squared = d[0] * d[0]
-    for along in d[1:]:
-        squared = squared + along * along
-    return d, squared
 
 
 def _slope(function: Callable[[Array], Array], at: Array) -> Array:

@@ -58,19 +58,23 @@ class Pairs(eqx.Module):
         """Whether the law must have a cut-off."""
         return False
 
-    def begin(self, position: tuple[Array, ...], reach: Array | None) -> Any:
+    # The periods `box` (D,) [m] are passed to the four that follow only where the system's net has some.
+
+    def begin(self, position: tuple[Array, ...], reach: Array | None, box: Array | None = None) -> Any:
         """What is remembered between steps, made from the positions; None where nothing is."""
         return None
 
-    def keep(self, memory: Any, position: tuple[Array, ...], reach: Array | None) -> Any:
+    def keep(self, memory: Any, position: tuple[Array, ...], reach: Array | None, box: Array | None = None) -> Any:
         """The memory at the start of another run: as it is where it serves these positions, else new."""
         return memory
 
-    def ready(self, memory: Any, position: tuple[Array, ...], reach: Array | None) -> Any:
+    def ready(self, memory: Any, position: tuple[Array, ...], reach: Array | None, box: Array | None = None) -> Any:
         """The memory as `visit` takes it, at these positions; `memory` is None in a state that has not begun."""
         return memory
 
-    def update(self, memory: Any, before: tuple[Array, ...], position: tuple[Array, ...], reach: Array | None) -> tuple[Any, Status]:
+    def update(
+        self, memory: Any, before: tuple[Array, ...], position: tuple[Array, ...], reach: Array | None, box: Array | None = None
+    ) -> tuple[Any, Status]:
         """The memory after a step from `before` to `position`."""
         return memory, Status.ok()
 

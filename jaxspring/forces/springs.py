@@ -24,8 +24,10 @@ from ..state import State
 from ..status import Flag
 from ..topology.base import Topology
 from ..topology.edge_field import EdgeField, ZeroOutside
+from ..topology.periods import box_of
 from ..vector import Vector
 from .base import Finding, Force, any_refused
+from .in_box import along_axes, check_rest_length, long_springs, turned_springs
 from .laws import Hooke, Law, PowerLaw, TensionOnly, has_no_direction, is_beyond_range, length_of, spring_block, spring_energy, spring_pull
 from .linearisation import Linearisation
 from .living import counted, heeding, living, map_living
@@ -85,7 +87,8 @@ class Springs(Force):
     rest lengths that have changed take the place of the given ones.
 
     Raises:
-        ValueError: a negative or non-finite constant (named with its index), a shape that fits neither one number nor one per spring.
+        ValueError: a negative or non-finite constant (named with its index), a shape that fits neither one number nor one per spring, a
+            rest length that no image of the net's box can have.
     """
 
     net: Topology
@@ -119,6 +122,8 @@ class Springs(Force):
             why = "A negative stiffness pushes without bound. Pass allow_negative_stiffness=True if meant."
             _check_sign("stiffness", self.stiffness, why, any_sign=allow_negative_stiffness)
         _check_sign("rest_length", self.rest_length, "A length cannot be negative.")
+        if self.axes is None:
+            check_rest_length(net, self.rest_length)
         if isinstance(self.law, PowerLaw):
             for entry in self.rest_length.families if isinstance(self.rest_length, EdgeField) else (self.rest_length,):
                 positive("rest_length", entry, "The power law divides by it.")
@@ -140,7 +145,7 @@ class Springs(Force):
         pull = partial(spring_pull, self.law)
         if isinstance(self.stiffness, ZeroOutside) and self.law.is_finite_at_zero:
             pull, constants = heeding(self.net, state, pull, *self._constants(state))
-            return self._embed(self.net.net_pull(pull, self._seen(state), *constants), state)
+            return self._embed(self._near().net_pull(pull, self._seen(state), *constants), state)
         return self._embed(self.net.accumulate(self._each(state, pull)), state)
 
     def energy(self, state: State) -> Array | None:
@@ -196,12 +201,16 @@ class Springs(Force):
     def diagnose(self, state: State) -> tuple[Finding, ...]:
         """COINCIDENT: springs whose ends are at one place, or so near that the square of their distance underflows, where they have a rest
         length; under a law of one's own also without, unless they are at one place exactly. NONFINITE: springs so long that it overflows.
+        BOX: springs of half a period.
         """
+        if self.net.n_springs == 0:
+            return ()
+        in_box = long_springs(self._near(), self._seen(state), living(self.net, state))
         is_linear = isinstance(self.law, Hooke | TensionOnly)
         given = state.rest_length is None and is_concrete(self.rest_length) and is_linear
-        if self.net.n_springs == 0 or (given and not jnp.any(self.rest_length > 0)):
+        if given and not jnp.any(self.rest_length > 0):
             # A pull k d takes no square.
-            return ()
+            return in_box
 
         def coincident(d: Vector, _: Array, l: Array) -> Array:
             needs_direction = l > 0
@@ -214,12 +223,20 @@ class Springs(Force):
 
         nowhere = jnp.asarray(-1, jnp.int32)
         counts = (self.net.sum(self._each(state, of_family)) for of_family in (coincident, beyond))
-        return tuple(Finding(flag, n, nowhere) for flag, n in zip((Flag.COINCIDENT, Flag.NONFINITE), counts, strict=True))
+        return (*in_box, *(Finding(flag, n, nowhere) for flag, n in zip((Flag.COINCIDENT, Flag.NONFINITE), counts, strict=True)))
+
+    def diagnose_since(self, start: State, state: State) -> tuple[Finding, ...]:
+        """BOX: springs that pull to another image than at the start."""
+        if self.net.n_springs == 0:
+            return ()
+        return turned_springs(self._near(), self._seen(start), self._seen(state), living(self.net, state))
 
     def invalid(self) -> Array | None:
         """Whether a constant is negative or not finite."""
         rule = self.stiffness
         bad = any_refused(self.rest_length, *(() if isinstance(rule, StiffnessRule) or self.allow_negative_stiffness else (rule,)))
+        if box_of(self.net) is not None:
+            bad = bad | any_refused(box_of(self.net))
         by_rule = rule.invalid() if isinstance(rule, StiffnessRule) else None
         bad = bad if by_rule is None else bad | by_rule
         by_expansion = None if self.expansion is None else self.expansion.invalid()
@@ -262,6 +279,10 @@ class Springs(Force):
             raise ValueError(f"axes = {self.axes}, but the positions have {state.dim} coordinates.")
         return state.position if self.axes is None else Vector(tuple(state.position[a] for a in self.axes))
 
+    def _near(self) -> Topology:
+        """The net with the periods of the coordinates that the springs act in."""
+        return along_axes(self.net, self.axes)
+
     def _constants(self, state: State) -> tuple[Array | EdgeField, Array | EdgeField]:
         rule = self.stiffness
         k = rule.stiffness(self.net, state) if isinstance(rule, StiffnessRule) else self.net.edge_field(rule, "stiffness")
@@ -273,7 +294,7 @@ class Springs(Force):
 
     def _along(self, state: State) -> tuple[EdgeField, Array | EdgeField, Array | EdgeField]:
         k, l = self._constants(state)
-        d = self.net.difference(self._seen(state))
+        d = self._near().difference(self._seen(state))
         return d if self.law.is_finite_at_zero else self._filled(d), k, l
 
     def _filled(self, d: EdgeField) -> EdgeField:

@@ -38,7 +38,8 @@ class Image(eqx.Module):
         origin: position `(x, y)` of pixel `values[0, 0]`, in the same unit.
 
     Raises:
-        ValueError: no pixels, not two axes, a pixel that is NaN or infinite, a spacing that is not positive.
+        ValueError: no pixels, not two axes, a pixel that is NaN or infinite, a spacing that is not positive, an origin that the pixels'
+            type cannot hold to a thousandth of the spacing.
             Of traced values only shape and type are looked at.
         TypeError: complex, text or half-precision pixels.
 
@@ -56,6 +57,7 @@ class Image(eqx.Module):
         self.values = _as_pixels(values)
         self.spacing = _per_axis("spacing", spacing, self.values.dtype, must_be_positive=True)
         self.origin = _per_axis("origin", origin, self.values.dtype)
+        _check_place(origin, self.origin, self.spacing)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -125,6 +127,21 @@ def _per_axis(name: str, value: PerAxis, dtype: jnp.dtype, must_be_positive: boo
             wanted = "positive and finite" if must_be_positive else "finite"
             raise ValueError(f"{name} along {axis} is {part}, but must be {wanted}: every sample would be wrong. Correct {name}.")
     return owned[0], owned[1]
+
+
+def _check_place(given: Any, origin: tuple[Array, Array], spacing: tuple[Array, Array]) -> None:
+    """Raise ValueError where rounding to the pixels' type moves the origin by a part of a pixel that counts."""
+    pair: tuple[Any, ...] = tuple(given) if isinstance(given, (tuple, list)) or np.ndim(given) == 1 else (given, given)
+    for axis, exact, held, step in zip("xy", pair, origin, spacing, strict=True):
+        if any(isinstance(value, Tracer) for value in (exact, held, step)):
+            continue
+        error = abs(float(held) - float(exact))
+        if error > 1e-3 * float(step):
+            raise ValueError(
+                f"origin along {axis} is {exact}, which {held.dtype} holds as {float(held)!r}: the image would lie "
+                f"{error / float(step):.2g} pixels off. Subtract the origin from it and from the nodes, or pass float64 pixels with "
+                f"jax_enable_x64 on."
+            )
 
 
 def _as_pixels(values: ArrayLike) -> Array:

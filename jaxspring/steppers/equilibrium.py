@@ -34,6 +34,7 @@ from ..numerics import stopped
 from ..state import State
 from ..status import Flag, Status
 from ..system import System
+from ..topology.periods import box_of
 from ..vector import Vector
 from .truncated import Ended, truncated_cg
 
@@ -48,7 +49,7 @@ class Equilibrium(eqx.Module):
         state: the static shape, at rest.
         info: net force over the size of the forces; iterations of conjugate gradients.
         newton_iterations: steps of the trust region.
-        status: OK, or MECHANISM, UNSTABLE, SOLVER, NONFINITE; see `raise_for_status`.
+        status: OK, or MECHANISM, UNSTABLE, SOLVER, NONFINITE, BOX; see `raise_for_status`.
         effects: names of the system's forces, for messages (static).
     """
 
@@ -83,7 +84,8 @@ def equilibrium(
 
     Returns:
         An `Equilibrium`. Its status says MECHANISM where the net can move without a force, or where its energy falls without end, and
-        UNSTABLE where forces balance but the shape is no minimum, as in a straight chain under pressure: push it a little.
+        UNSTABLE where forces balance but the shape is no minimum, as in a straight chain under pressure: push it a little. BOX: a spring
+        of a periodic net came to half a period, and turned.
 
     Raises:
         ValueError: a tolerance or a number of iterations that is not positive.
@@ -284,7 +286,7 @@ def _find(search: _Search, system: System, state: State) -> Equilibrium:
     scene = _Scene(ready, start.moved(anchor, Vector.zeros_like(anchor)))
     still = stopped(scene)
     end = search.run(still)
-    status = _status(still, end)
+    status = _status(still, end).then(_in_box(still, end))
     trust = jnp.where(status.is_ok, jnp.ones_like(end.goal), jnp.full_like(end.goal, jnp.nan))
     u = implicitly(_Balance(search.adjoint, trust), scene, end.u)
     relative = search.tolerance_for(end.goal.dtype) * norm(end.force) / jnp.where(end.goal > 0, end.goal, jnp.ones_like(end.goal))
@@ -305,6 +307,18 @@ def _status(scene: _Scene, end: _Progress) -> Status:
     is_loose = ran_away | (is_settled & ~is_unstable & (end.curvature <= 100 * eps))
     status = Status.when(Flag.NONFINITE, ~is_number).then(Status.when(Flag.MECHANISM, is_loose))
     return status.then(Status.when(Flag.UNSTABLE, is_unstable)).then(Status.when(Flag.SOLVER, is_number & ~is_settled & ~ran_away))
+
+
+def _in_box(scene: _Scene, end: _Progress) -> Status:
+    """BOX where a spring of a periodic net has come to half a period, or turned to another image."""
+    status, state = Status.ok(), scene.at(end.u)
+    if box_of(scene.system.net) is None:
+        return status
+    for i, force in enumerate(scene.system.forces):
+        for found in (*force.diagnose(state), *force.diagnose_since(scene.start, state)):
+            if found.flag == Flag.BOX:
+                status = status.then(Status.when(found.flag, found.count > 0, effect=i, count=found.count))
+    return status
 
 
 def _drifts(at: _Progress, along: Vector, product: Callable[[Vector], Vector], stiffness: Array) -> Array:

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -25,6 +26,7 @@ from .._checks import as_inexact, finite, has_shape, shape_of
 from ..vector import Vector
 from .edge_field import EdgeField
 from .identity import NetIdentity
+from .periods import box_of, check_dim
 from .permutation import Permutation
 
 
@@ -43,6 +45,13 @@ class NodeLayout:
     def unflatten(self, flat: Array) -> Array:
         """(N,) in the user's order -> node array."""
         return (flat if self.permutation is None else self.permutation.inward(flat)).reshape(self.shape)
+
+
+def about_middle(points: Any) -> Any:
+    """(N, D) points of float64 where JAX has 32 bits: about their middle, for what no shift changes. All others as they are."""
+    if not isinstance(points, np.ndarray) or points.dtype != np.float64 or points.ndim != 2 or not points.size or jax.config.jax_enable_x64:
+        return points
+    return points - points.mean(axis=0)
 
 
 class Topology(eqx.Module):
@@ -235,6 +244,7 @@ class Topology(eqx.Module):
         points = as_inexact(name, points)
         if points.ndim != 2 or points.shape[0] != self.n_nodes or points.shape[1] not in (1, 2, 3):
             raise ValueError(f"{name} has shape {points.shape}; expected ({self.n_nodes}, D) with D = 1, 2 or 3 coordinates.")
+        check_dim(box_of(self), points.shape[1])
         finite(name, points)
         return Vector(tuple(self._order_nodes(points[:, i]) for i in range(points.shape[1])))
 
@@ -245,7 +255,7 @@ class Topology(eqx.Module):
 
     def lengths(self, position: Any) -> Array:
         """(E,) lengths of the springs [m] in the user's order, for a `Vector` or an (N, D) array of positions."""
-        x = position if isinstance(position, Vector) else self.vector_field(position, "position")
+        x = position if isinstance(position, Vector) else self.vector_field(about_middle(position), "position")
         if x.shape != self.node_shape:
             raise ValueError(f"position has shape {x.shape}, that of one state is {self.node_shape}. Take many by jax.vmap(net.lengths).")
         return self.flatten(self.difference(x).map(lambda d: d.norm()))

@@ -1,22 +1,23 @@
-"""Networks from what people have: points, triangles, a mesh file, a SciPy matrix, a NetworkX graph.
+"""Networks from what people have: points, triangles, a SciPy matrix, a NetworkX graph; mesh files: see `mesh_files`.
 
 Each builder makes a `Graph`. The package it needs is imported when it is called.
 """
 
 from __future__ import annotations
 
-import pathlib
 from collections.abc import Hashable
 from typing import Any
 
 import numpy as np
 
-from .._arrays import as_indices, given, on_host
-from .._checks import finite
+from .._arrays import given, on_host
+from .._checks import finite, triangle_indices
 from .graph import Graph
 from .reduction import Gather, Scatter
 
 Reductions = type[Gather] | type[Scatter] | None
+# How many roundings of a coordinate may lie between a node and the line of its neighbours on a straight border.
+ROUNDING = 8
 
 
 def from_triangles(triangles: Any, n_nodes: int, *, reduction: Reductions = None) -> Graph:
@@ -38,10 +39,7 @@ def from_triangles(triangles: Any, n_nodes: int, *, reduction: Reductions = None
     >>> net.n_springs, net.triangles.shape
     (5, (2, 3))
     """
-    corners = as_indices("triangles", triangles)
-    if corners.ndim != 2 or corners.shape[1] != 3 or not len(corners):
-        raise ValueError(f"triangles has shape {corners.shape}; expected (T, 3): three node numbers for each of T >= 1 triangles.")
-    _check_corners(corners, n_nodes)
+    corners = triangle_indices("triangles", triangles, n_nodes)
     return Graph.from_edges(_sides(corners), n_nodes, triangles=corners, reduction=reduction)
 
 
@@ -56,7 +54,7 @@ def delaunay(points: Any, *, reduction: Reductions = None) -> Graph:
         A `Graph` on all N points. `net.triangles` holds the triangles; in space, those of the convex hull.
 
     Raises:
-        ValueError: a wrong shape, NaN, too few points, all points on one line or plane, two points at one place.
+        ValueError: a wrong shape, NaN, too few points, all points on one line or plane, two points at one place, named with both indices.
 
     >>> net = delaunay([(0, 0), (1, 0), (0, 1), (1, 1.1)])
     >>> net.n_springs, net.triangles.shape
@@ -71,58 +69,21 @@ def delaunay(points: Any, *, reduction: Reductions = None) -> Graph:
     n_nodes, dim = points.shape
     if n_nodes <= dim:
         raise ValueError(f"points holds {n_nodes} points; a triangulation in {dim} coordinates needs at least {dim + 1}.")
+    # Qhull squares coordinates: far from the origin no digit of a spacing would be left, and far from 1 it would overflow.
+    local = points - points.mean(axis=0)
+    local = local / (np.abs(local).max() or 1.0)
+    rounding = ROUNDING * np.finfo(float).eps * max(np.abs(points).max() / (np.ptp(points, axis=0).max() or 1.0), 1.0)
+    _refuse_doubled(local, *_doubled(points))
+    flat = f"points has no triangulation: all {n_nodes} points lie on one {'line' if dim == 2 else 'plane'}. Use Graph.from_edges."
+    if np.linalg.svd(local, compute_uv=False)[-1] <= rounding * np.sqrt(n_nodes):
+        raise ValueError(flat)
     try:
-        found = Delaunay(points)
+        found = Delaunay(local)
     except QhullError as error:
-        flat = "line" if dim == 2 else "plane"
-        raise ValueError(f"points has no triangulation: all {n_nodes} points may lie on one {flat}. Use Graph.from_edges.") from error
-    if len(found.coplanar):
-        left_out, _, nearest = (int(i) for i in found.coplanar[0])
-        raise ValueError(
-            f"points[{left_out}] is at the place of points[{nearest}] (or too near to tell apart), so no triangle has it as a corner "
-            f"and it would hang free. Remove points[{left_out}] ({len(found.coplanar)} of {n_nodes} points are such)."
-        )
-    surface = found.simplices if dim == 2 else found.convex_hull
-    return Graph.from_edges(_sides(found.simplices), n_nodes, triangles=surface, reduction=reduction)
-
-
-def from_mesh(path: str | pathlib.Path, *, reduction: Reductions = None) -> tuple[Graph, np.ndarray]:
-    """A network from a surface mesh file: OBJ, STL, PLY, OFF and what else trimesh reads. Needs the extra `mesh`.
-
-    Vertices at one place are merged, so that seams of texture or normals do not tear the net. Unused vertices are dropped.
-
-    Args:
-        path: the file.
-        reduction: see `Graph.from_edges`.
-
-    Returns:
-        `(net, points)`: a `Graph` with the file's triangles, and the (N, 3) positions of its nodes in the file's unit of length.
-
-    Raises:
-        ImportError: trimesh is not installed.
-        FileNotFoundError: no such file.
-        ValueError: a file that cannot be read, or that holds no triangle.
-    """
-    try:
-        import trimesh
-    except ImportError as error:
-        raise ImportError("from_mesh reads files with trimesh, which is not installed. Run: pip install 'jaxspring[mesh]'") from error
-    path = pathlib.Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"There is no file {path}.")
-    try:
-        mesh = trimesh.load_mesh(path, process=False)
-    except Exception as error:  # each format fails in its own way
-        raise ValueError(f"{path} cannot be read as a mesh: {error}") from error
-    faces = np.asarray(getattr(mesh, "faces", ()))
-    if not len(faces):
-        raise ValueError(f"{path} holds no triangle, so there is nothing to make springs of.")
-    mesh.merge_vertices(merge_tex=True, merge_norm=True)
-    mesh.update_faces(mesh.nondegenerate_faces())
-    mesh.remove_unreferenced_vertices()
-    points = np.array(mesh.vertices, float)
-    finite("points", points)
-    return from_triangles(np.asarray(mesh.faces, np.int64), len(points), reduction=reduction), points
+        raise ValueError(flat) from error
+    _refuse_doubled(local, found.coplanar[:, 0], found.coplanar[:, 2])
+    simplices, surface = _without_slivers(local, found.simplices, found.neighbors, rounding)
+    return Graph.from_edges(_sides(simplices), n_nodes, triangles=simplices if dim == 2 else surface, reduction=reduction)
 
 
 def from_scipy(matrix: Any, *, reduction: Reductions = None) -> tuple[Graph, np.ndarray]:
@@ -227,23 +188,54 @@ def _attribute(name: str, tail: Hashable, head: Hashable, data: dict[Any, Any]) 
     return float(array)
 
 
+def _doubled(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points at exactly the place of an earlier one, and that one."""
+    _, first, inverse = np.unique(points + 0.0, axis=0, return_index=True, return_inverse=True)
+    first = first[inverse.ravel()]
+    later = np.flatnonzero(first != np.arange(len(points)))
+    return later, first[later]
+
+
+def _refuse_doubled(local: np.ndarray, left_out: np.ndarray, nearest: np.ndarray) -> None:
+    if not len(left_out):
+        return
+    first = int(np.argmin(left_out))
+    one, other = int(left_out[first]), int(nearest[first])
+    apart = float(np.linalg.norm(local[one] - local[other]))
+    where = "at the place of" if apart == 0 else f"only {apart:.1g} of the points' extent away from"
+    raise ValueError(
+        f"points[{one}] is {where} points[{other}], too near to tell apart, so no triangle has it as a corner and it would hang free. "
+        f"Remove points[{one}] ({len(left_out)} of {len(local)} points are such)."
+    )
+
+
+def _without_slivers(points: np.ndarray, simplices: np.ndarray, neighbours: np.ndarray, rounding: float) -> tuple[np.ndarray, np.ndarray]:
+    """The simplices without those on the outside that are thinner than the coordinates' rounding, and the faces on the outside.
+
+    Nodes on a straight border are never quite on one line far from the origin: without this, springs would run along all of it.
+    """
+    dim = points.shape[1]
+    corners = points[simplices]
+    # The face opposite to each corner, and the corner's height over it: the volume is the same for all.
+    faces = np.stack([np.delete(simplices, i, axis=1) for i in range(dim + 1)], axis=1)
+    volume = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1]))
+    sides = points[faces[:, :, 1:]] - points[faces[:, :, :1]]
+    gram = sides @ np.swapaxes(sides, -1, -2)
+    height = volume[:, None] / np.sqrt(np.maximum(np.linalg.det(gram), np.finfo(float).tiny))
+    kept, outside = np.ones(len(simplices), bool), neighbours == -1
+    while True:
+        thin = kept & (outside & (height <= rounding)).any(axis=1)
+        if not thin.any():
+            break
+        kept &= ~thin
+        outside |= (neighbours >= 0) & ~kept[neighbours]
+    if len(np.unique(simplices[kept])) < len(points):
+        kept, outside = np.ones(len(simplices), bool), neighbours == -1
+    return simplices[kept], faces[kept][outside[kept]]
+
+
 def _sides(simplices: np.ndarray) -> np.ndarray:
     """(E, 2) distinct sides of triangles or tetrahedra, lower node first, sorted."""
     n = simplices.shape[1]
     sides = np.concatenate([simplices[:, [i, j]] for i in range(n) for j in range(i + 1, n)])
     return np.unique(np.sort(sides, axis=1), axis=0)
-
-
-def _check_corners(corners: np.ndarray, n_nodes: int) -> None:
-    bad = (corners < 0) | (corners >= n_nodes)
-    if bad.any():
-        row, column = (int(i) for i in np.argwhere(bad)[0])
-        raise ValueError(
-            f"triangles[{row}] = {tuple(corners[row].tolist())} names node {corners[row, column]}, but there are n_nodes = {n_nodes} "
-            f"(nodes are 0 to {n_nodes - 1}).\nUnchecked, JAX would read another node instead. Fix triangles[{row}]."
-        )
-    a, b, c = corners.T
-    same = (a == b) | (b == c) | (c == a)
-    if same.any():
-        row = int(np.argmax(same))
-        raise ValueError(f"triangles[{row}] = {tuple(corners[row].tolist())} has a corner twice: it is no triangle. Remove it.")

@@ -22,7 +22,7 @@ from ..vector import Vector
 from .base import Topology
 from .edge_field import EdgeField
 from .identity import NetIdentity
-from .lattice import _as_box, minimum_image
+from .periods import as_box, minimum_image
 from .permutation import Permutation
 from .reduction import Gather, Reduction, Scatter, choose_reduction
 
@@ -66,7 +66,8 @@ class Graph(Topology):
                 None takes `Gather`, but `Scatter` on a CPU for more nodes than `FASTER_BY_SCATTER`.
 
         Raises:
-            ValueError: no node, a node that does not exist, a spring that joins a node to itself.
+            ValueError: no node, a node that does not exist, a spring that joins a node to itself, a triangle with a corner twice, a period
+                that is negative or not finite.
             TypeError: node numbers that are not integers, or are traced.
 
         >>> net = Graph.from_edges([(0, 1), (1, 2)], n_nodes=3)
@@ -88,7 +89,7 @@ class Graph(Topology):
             tails=jnp.asarray(tails),
             heads=jnp.asarray(heads),
             reduction=sums,
-            box=_as_box(box),
+            box=as_box(box),
             triangles=None if triangles is None else _as_triangles(triangles, n_nodes),
             count=n_nodes,
             nodes=nodes,

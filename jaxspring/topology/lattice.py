@@ -2,7 +2,7 @@
 
 A node field is an array of shape (n,), (ny, nx) or (nz, ny, nx). A spring family is one offset: its springs join every node `i`
 to node `i + offset`. Differences and sums on the nodes are shifted slices (see `shifts`), so no index is ever read. On a periodic
-axis the slice is a roll, and `box` (the period in each coordinate, [m]) takes the minimum image.
+axis the slice is a roll, and `box` (the period in each coordinate, [m]) takes the nearest image: see `periods`.
 """
 
 from __future__ import annotations
@@ -20,13 +20,14 @@ from jax import lax
 from jaxtyping import Array
 
 from .._arrays import whole_number
-from .._checks import as_inexact
+from .._checks import is_concrete
 from ..numerics import linear_call
 from ..vector import Vector
 from . import shifts
 from .base import Topology
 from .edge_field import EdgeField
 from .identity import NetIdentity
+from .periods import as_box, check_wrapped, minimum_image
 
 Offset = tuple[int, ...]
 
@@ -209,11 +210,35 @@ class Lattice(Topology):
         entries = zip(field.families, self.offsets, strict=True)
         return self.own(shifts.inside(self.grid_shape, entry, offset, fill) for entry, offset in entries)
 
-    def grid(self, spacing: float | Sequence[float] = 1.0) -> np.ndarray:
-        """(N, D) rest positions [m] of a grid with `spacing` along x (last axis), y, z."""
-        steps = np.broadcast_to(np.asarray(spacing, float), (len(self.shape),))
+    def grid(self, spacing: float | Sequence[float] | None = None) -> np.ndarray:
+        """(N, D) rest positions [m] of a grid with `spacing` along x (last axis), y, z.
+
+        None is 1 m, and the period over the number of nodes along an axis that wraps.
+
+        Raises:
+            ValueError: a spacing that does not fit the period of an axis that wraps.
+        """
+        wanted = np.broadcast_to(np.asarray(1.0 if spacing is None else spacing, float), (len(self.shape),))
+        steps = [self._step(axis, h, spacing is None) for axis, h in enumerate(wanted[::-1])][::-1]
         axes = np.meshgrid(*(np.arange(n) for n in self.shape), indexing="ij")
         return np.stack([axis.ravel() * h for axis, h in zip(axes[::-1], steps, strict=True)], axis=-1)
+
+    def _step(self, axis: int, spacing: float, may_be_chosen: bool) -> float:
+        """The spacing along an axis, which must close where the axis wraps."""
+        coordinate, n = len(self.shape) - 1 - axis, self.shape[axis]
+        if not self.periodic[axis] or self.box is None or not is_concrete(self.box) or self.box.shape[0] <= coordinate:
+            return spacing
+        period = float(self.box[coordinate])
+        if period == 0 or abs(n * spacing - period) <= 1e-6 * period:
+            return spacing
+        if may_be_chosen:
+            return period / n
+        name = "xyz"[coordinate]
+        raise ValueError(
+            f"spacing = {spacing} along {name} takes {n} nodes once round {n * spacing:.9g} m, but box[{coordinate}] = {period:.9g} m. "
+            f"The wrapped springs alone would be stretched. Pass spacing = {period / n:.9g}, or build the lattice with a period of "
+            f"{n * spacing:.9g}; strain a net by its points."
+        )
 
 
 def lattice(
@@ -231,7 +256,8 @@ def lattice(
         box: (D,) period of each coordinate [m] where an axis wraps; zero where a coordinate does not. Required if any axis wraps.
 
     Raises:
-        ValueError: an empty lattice, more than three axes, a family that this dimension lacks, a wrap without a box.
+        ValueError: an empty lattice, more than three axes, a family that this dimension lacks, a wrap without a box, a period that is
+            negative, not finite, or zero along an axis that wraps.
 
     >>> net = lattice((3, 4), springs=STRUCTURAL + SHEAR)
     >>> net.n_nodes, net.n_springs
@@ -247,36 +273,14 @@ def lattice(
     if len(wraps) != len(shape):
         raise ValueError(f"periodic has {len(wraps)} entries, but shape = {shape} has {len(shape)} axes.")
     offsets = tuple(o for o in springs.offsets(len(shape)) if all(w or abs(s) < n for s, n, w in zip(o, shape, wraps, strict=True)))
+    box = as_box(box)
     if any(wraps):
-        _check_wrap(shape, wraps, offsets, box)
-    return Lattice(shape, offsets, wraps, _as_box(box))
+        check_wrapped(shape, wraps, box)
+        _check_wrap(shape, wraps, offsets)
+    return Lattice(shape, offsets, wraps, box)
 
 
-def minimum_image(d: Vector, box: Array) -> Vector:
-    """`d` shifted by whole periods to its shortest image; a period of zero leaves that coordinate alone."""
-    if box.shape[0] != d.dim:
-        raise ValueError(f"box has {box.shape[0]} periods, but positions have {d.dim} coordinates.")
-
-    def wrap(a: Array, period: Array) -> Array:
-        period = period.astype(a.dtype)
-        turns = jnp.round(a / jnp.where(period > 0, period, jnp.ones_like(period)))
-        return a - jnp.where(period > 0, period, jnp.zeros_like(period)) * lax.stop_gradient(turns)
-
-    return Vector(tuple(wrap(a, period) for a, period in zip(d, box, strict=True)))
-
-
-def _as_box(box: Any) -> Array | None:
-    if box is None:
-        return None
-    box = as_inexact("box", box)
-    if box.ndim != 1 or box.shape[0] not in (1, 2, 3):
-        raise ValueError(f"box has shape {box.shape}; expected (D,): one period per coordinate, 0 where it is not periodic.")
-    return box
-
-
-def _check_wrap(shape: tuple[int, ...], wraps: tuple[bool, ...], offsets: tuple[Offset, ...], box: Any) -> None:
-    if box is None:
-        raise ValueError("A periodic lattice needs box=(period of x, y, ...) [m]: without it a wrapped spring would span the lattice.")
+def _check_wrap(shape: tuple[int, ...], wraps: tuple[bool, ...], offsets: tuple[Offset, ...]) -> None:
     for axis, (n, wrap) in enumerate(zip(shape, wraps, strict=True)):
         reach = max((abs(offset[axis]) for offset in offsets), default=0)
         if wrap and n <= 2 * reach:
@@ -307,4 +311,4 @@ def _sum_at_nodes(grid: shifts.Grid, _: Any, values: tuple[Array, ...]) -> Array
     return shifts.sum_at_nodes(grid, values)
 
 
-__all__ = ["BEND", "BODY", "SHEAR", "STRUCTURAL", "Lattice", "SpringFamilies", "lattice", "minimum_image"]
+__all__ = ["BEND", "BODY", "SHEAR", "STRUCTURAL", "Lattice", "SpringFamilies", "lattice"]

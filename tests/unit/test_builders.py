@@ -7,7 +7,8 @@ import scipy.sparse
 import scipy.spatial
 import trimesh
 
-from jaxspring.topology.builders import delaunay, from_mesh, from_networkx, from_scipy, from_triangles
+from jaxspring.topology.builders import delaunay, from_networkx, from_scipy, from_triangles
+from jaxspring.topology.mesh_files import from_mesh
 
 
 def pairs(edges):

@@ -134,12 +134,7 @@ def rollout(
     1.0
     """
     _check_steps(n_steps, save_every, observe, check_every)
-    dt = as_inexact("dt", dt, state.checked().dtype)
-    has_shape("dt", dt, {"one number": ()})
-    if is_concrete(dt):
-        finite("dt", dt)
-        if np.asarray(dt) < 0 and not stepper.runs_backward:
-            raise ValueError(f"dt = {dt}, but {type(stepper).__name__} does not run backward. Use VelocityVerlet(), or a positive dt.")
+    dt = _checked_dt(dt, state, stepper)
     plan = make_plan(n_steps, save_every, Checkpointed() if adjoint is None else adjoint, check_every)
     if resume is not None:
         check_kind(resume)
@@ -346,6 +341,16 @@ def _joined(first: Result, latest: Result) -> Info:
     if solves is not None and first.info.solves is not None:
         solves = first.info.solves.joined(solves)
     return Info(first.info.stable_dt, latest.info.n_steps, solves, latest.info.solves_saved)
+
+
+def _checked_dt(dt: Any, state: State, stepper: Stepper) -> Array:
+    dt = as_inexact("dt", dt, state.checked().dtype)
+    has_shape("dt", dt, {"one number": ()})
+    if is_concrete(dt):
+        finite("dt", dt)
+        if dt < 0 and not stepper.runs_backward:
+            raise ValueError(f"dt = {dt}, but {type(stepper).__name__} does not run backward. Use VelocityVerlet(), or a positive dt.")
+    return dt
 
 
 def _check_steps(n_steps: int, save_every: int | None, observe: Any, check_every: int | None) -> None:

@@ -24,6 +24,7 @@ LAYERS = {
     "files": 3,
     "forces": 3,
     "thermal": 3,
+    "masses": 4,
     "system": 4,
     "edit": 4,
     "stability": 4,

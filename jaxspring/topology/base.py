@@ -46,9 +46,10 @@ class NodeLayout:
 
 def about_middle(points: Any) -> Any:
     """(N, D) points of float64 where JAX has 32 bits: about their middle, for what no shift changes. All others as they are."""
-    if not isinstance(points, np.ndarray) or points.dtype != np.float64 or points.ndim != 2 or not points.size or jax.config.jax_enable_x64:
+    if not isinstance(points, np.ndarray) or points.dtype != np.float64 or points.ndim != 2 or not points.size:
         return points
-    return points - points.mean(axis=0)
+    held = jax.dtypes.canonicalize_dtype(np.float64)
+    return points if held == np.float64 else points - points.mean(axis=0)
 
 
 class Topology(eqx.Module):

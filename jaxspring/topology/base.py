@@ -49,9 +49,11 @@ class NodeLayout:
 
 def about_middle(points: Any) -> Any:
     """(N, D) points of float64 where JAX has 32 bits: about their middle, for what no shift changes. All others as they are."""
-    if not isinstance(points, np.ndarray) or points.dtype != np.float64 or points.ndim != 2 or not points.size or jax.config.jax_enable_x64:
+    if not isinstance(points, np.ndarray) or points.dtype != np.float64 or points.ndim != 2 or not points.size:
         return points
-    return points - points.mean(axis=0)
+    is_held = jax.dtypes.canonicalize_dtype(np.float64) == np.float64
+    # What is not finite must not spread to the others: it is refused later, by its index.
+    return points if is_held or not np.isfinite(points).all() else points - points.mean(axis=0)
 
 
 class Topology(eqx.Module):

@@ -141,10 +141,10 @@ def _near(points: np.ndarray, used: np.ndarray, distance: float) -> np.ndarray:
     """For each vertex the first of those that it hangs together with by steps of at most `distance`."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     numbers = np.flatnonzero(used)
-    pairs = numbers[cKDTree(points[numbers]).query_pairs(distance, output_type="ndarray")]
+    pairs = numbers[KDTree(points[numbers]).query_pairs(distance, output_type="ndarray")]
     matrix = coo_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(len(points),) * 2)
     label = connected_components(matrix, directed=False)[1]
     return np.unique(label, return_index=True)[1][label]

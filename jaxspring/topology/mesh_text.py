@@ -172,6 +172,7 @@ READERS = {".obj": read_obj, ".off": read_off, ".ply": read_ply}
 def _rows(path: pathlib.Path) -> Iterator[tuple[int, list[str]]]:
     """(number, words) of the lines that hold any: without comments, continued where one ends in a backslash."""
     pending: list[str] = []
+    number = 0
     # Latin-1 knows every byte; names and comments in other alphabets are not read anyway.
     for number, line in enumerate(path.read_text(encoding="latin-1").removeprefix("\xef\xbb\xbf").splitlines(), 1):
         line = line.split("#", 1)[0].rstrip()

@@ -116,7 +116,7 @@ def _ears(flat: np.ndarray, names: np.ndarray) -> list[tuple[int, int, int]] | N
 
 def _holds(a: np.ndarray, b: np.ndarray, c: np.ndarray, p: np.ndarray) -> bool:
     """Whether p lies in the triangle or on its border."""
-    return min(_cross(b - a, p - a), _cross(c - b, p - b), _cross(a - c, p - c)) >= -STRAIGHT
+    return bool(min(_cross(b - a, p - a), _cross(c - b, p - b), _cross(a - c, p - c)) >= -STRAIGHT)
 
 
 def _area(flat: np.ndarray) -> float:

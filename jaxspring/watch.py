@@ -13,6 +13,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array
 
@@ -73,7 +74,7 @@ def begin(system: System, ready: System, carry: Carry, dt: Array, limit: Array |
     coordinates too large for the springs between them. The constants are read as the user gave them (`system`), which is one array
     where the prepared system (`ready`) holds one for every spring family.
     """
-    if not jax.config.jax_enable_x64:
+    if jax.dtypes.canonicalize_dtype(np.float64) != np.float64:
         system = cast_inexact(system, carry.state.dtype)  # constants of float64, made before x64 was switched off
     system, ready, carry, dt, limit = stopped((system, ready, carry, dt, limit))
     # Masses first: gravity holds them too, and would be blamed.

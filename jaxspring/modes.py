@@ -129,7 +129,7 @@ def frequency_response(system: System, state: State, frequencies: Any, force: An
     n = int(np.prod(state.checked().position.shape)) * state.dim
     if n > LARGEST_DENSE:
         raise ValueError(f"{n} unknowns (nodes times coordinates); the dense matrix of a frequency response may have {LARGEST_DENSE}.")
-    load = given("force", force)
+    load: Any = given("force", force)
     has_shape("force", load, {"per node and coordinate": (n // state.dim, state.dim)})
     parts = as_inexact("force", load.real, state.dtype), as_inexact("force", load.imag, state.dtype)
     frequencies = as_inexact("frequencies", frequencies, state.dtype)

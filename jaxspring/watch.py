@@ -14,6 +14,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array
 
@@ -112,7 +113,7 @@ def begin(system: System, ready: System, precise: Precision, carry: Carry, dt: A
     coordinates too large for the springs between them. The constants are read as the user gave them, which is one array where the prepared
     system (`ready`) holds one for every spring family.
     """
-    if not jax.config.jax_enable_x64:
+    if jax.dtypes.canonicalize_dtype(np.float64) != np.float64:
         system = cast_inexact(system, carry.state.dtype)  # constants of float64, made before x64 was switched off
     system, carry, dt, limit = stopped((system, carry, dt, limit))
     # Masses first: gravity holds them too, and would be blamed.

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -45,22 +46,22 @@ def smooth(image: Image, sigma: Length, radius: int | None = None) -> Image:
     >>> print((1000 * smooth(spike, 1.0).values).round())
     [[ 58. 242. 399. 242.  58.]]
     """
-    sigma = given("sigma", sigma)
-    width = as_inexact("sigma", sigma, image.dtype)
+    asked: Any = given("sigma", sigma)  # as it was passed: inside `jit` a number is a constant still
+    width = as_inexact("sigma", asked, image.dtype)
     has_shape("sigma", width, {"one number": ()})
-    is_traced = any(isinstance(length, Tracer) for length in (sigma, *image.spacing))
+    is_traced = any(isinstance(length, Tracer) for length in (asked, *image.spacing))
     if radius is None:
         if is_traced:
             raise TypeError(
                 "smooth: sigma (or the image's spacing) is traced, so the width of the kernel cannot follow it.\n"
                 "Pass radius=smoothing_radius(largest_sigma, spacing), a number of pixels computed outside jit and grad."
             )
-        radius = smoothing_radius(sigma, image.spacing)
+        radius = smoothing_radius(asked, image.spacing)
     _check_radius(radius)
     if not is_traced:
-        least = smoothing_radius(sigma, image.spacing, deviations=2.0)
+        least = smoothing_radius(asked, image.spacing, deviations=2.0)
         if radius < least:
-            raise ValueError(f"radius = {radius} pixels is under two standard deviations, sigma = {float(sigma)}: pass radius >= {least}.")
+            raise ValueError(f"radius = {radius} pixels is under two standard deviations, sigma = {float(asked)}: pass radius >= {least}.")
     values = image.values
     for axis, spacing in ((1, image.spacing[0]), (0, image.spacing[1])):
         if values.shape[axis] > 1:

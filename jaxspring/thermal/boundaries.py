@@ -47,18 +47,17 @@ class ThermalBoundary(eqx.Module):
         Raises:
             ValueError: nodes that are those of another net.
         """
-        layout = getattr(self, "layout", net.layout)
-        if layout != net.layout:
-            raise ValueError(
-                f"{name} ({type(self).__name__}) names nodes on a net of shape {layout.shape}, in an order of its own inside; Heat's net "
-                f"has shape {net.node_shape}. Unchecked, it would act on other nodes. Build it with the net that you give Heat."
-            )
         for mask in (getattr(self, "nodes", None), self.held()):
             if mask is not None and mask.shape != net.node_shape:
                 raise ValueError(
                     f"{name} ({type(self).__name__}) names nodes on a net of shape {mask.shape}; expected {net.node_shape}, that of Heat's "
                     f"net. Unchecked, it would act on other nodes. Build it with the net that you give Heat."
                 )
+        if getattr(self, "layout", net.layout) != net.layout:
+            raise ValueError(
+                f"{name} ({type(self).__name__}) names nodes on a net in another order inside than Heat's net. Unchecked, it "
+                f"would act on other nodes. Build it with the net that you give Heat."
+            )
         return self
 
     def power(self, state: State, temperature: Array) -> Array | None:

@@ -36,7 +36,6 @@ def read_tiff(stream: IO[bytes], page: int | None, max_pixels: int) -> Pixels:
         tile = chosen.tilewidth * chosen.tilelength if chosen.is_tiled else 0
         if max(width * height * chosen.imagedepth, tile) > max(max_pixels, 0):
             raise ValueError(f"{width} x {height} pixels exceed max_pixels = {max_pixels}; make the image smaller or raise max_pixels.")
-        _check_segments(chosen, file.filehandle.size)
         values = _values(stream, chosen)
         hidden = None if mask is None else _upright(mask.asarray() == 0, chosen)
         text = chosen.tags.get(_NODATA_TAG)
@@ -59,13 +58,6 @@ def _pages(file: Any, page: int | None) -> tuple[Any, Any]:
     chosen = kept[page or 0]
     masks = [p for p in file.pages if p.subfiletype & 4 and p.shape[:2] == chosen.shape[:2]]
     return chosen, masks[0] if masks and len(kept) == 1 else None
-
-
-def _check_segments(page: Any, size: int) -> None:
-    """ValueError where strips or tiles lie beyond the end of the file: tifffile would put zeros there."""
-    ends = [offset + count for offset, count in zip(page.dataoffsets, page.databytecounts, strict=False)]
-    if not ends or max(ends) > size:
-        raise ValueError(f"the file is damaged or cut short: its pixels reach to byte {max(ends, default=0)} of {size}; fetch it again.")
 
 
 def _values(stream: IO[bytes], page: Any) -> NDArray[Any]:

@@ -204,9 +204,10 @@ def test_tiff_volumes_and_cut_files_are_refused(path, rng):
     """A volume in one page is no plane; strips beyond the end of the file are not zeros."""
     tifffile.imwrite(path, numbers(rng, "u1", (16, 32, 32)), photometric="minisblack", volumetric=True, tile=(16, 16, 16))
     assert "save one plane" in refusal(path)
-    tifffile.imwrite(path, np.ones((64, 64), np.float32), photometric="minisblack", rowsperstrip=8, compression="zlib")
-    path.write_bytes(path.read_bytes()[:-40])
-    assert "cut short" in refusal(path)
+    for options in ({"rowsperstrip": 8, "compression": "zlib"}, {"tile": (16, 16)}, {"rowsperstrip": 64}):
+        tifffile.imwrite(path, np.ones((64, 64), np.float32), photometric="minisblack", **options)
+        path.write_bytes(path.read_bytes()[:-40])
+        assert "cut short" in refusal(path)
 
 
 def test_tiff_that_would_be_cut_to_8_bits_is_refused(path, rng):

@@ -68,8 +68,18 @@ def on_states(event: Any, as_state: Callable[[Any, Any, Any], Any], flow: Callab
         flow: (time, y, args) -> dy/dt.
         start: (time, y, args) at the start.
         t1: time of the end, for the direction of time.
+
+    Raises:
+        ValueError: a boolean beside a root finder in another precision than JAX's own.
     """
     conditions = jax.tree.map(lambda f: _starting(Condition(f, as_state), flow, start, t1), event.cond_fn, is_leaf=callable)
+    booleans = [c.side is None for c in jax.tree.leaves(conditions, is_leaf=lambda leaf: isinstance(leaf, Condition))]
+    own, needed = start[0].dtype, jnp.result_type(float)
+    if event.root_finder is not None and any(booleans) and own != needed:
+        raise ValueError(
+            f"With a root finder and a boolean condition, diffrax needs the run in {needed}, and it is in {own}. "
+            "Make the condition a number, such as its distance from zero, leave the root finder out, or build the state in that type."
+        )
     return eqx.tree_at(lambda e: e.cond_fn, event, conditions, is_leaf=callable)
 
 

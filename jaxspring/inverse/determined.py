@@ -82,7 +82,7 @@ def from_jacobian(jacobian: np.ndarray, residuals: np.ndarray, start: PyTree, be
         return None
     relative = relative[:, is_inside]
     n_rows, n_inside = relative.shape
-    compressed = np.linalg.qr(relative, mode="r") if n_rows > n_inside else relative
+    compressed = np.asarray(np.linalg.qr(relative, mode="r")) if n_rows > n_inside else relative
     found = _rank_null(compressed, eps)
     if n_rows > n_inside and _is_at_minimum(relative, residuals):
         _, values, rows = np.linalg.svd(compressed, full_matrices=False)

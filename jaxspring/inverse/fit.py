@@ -225,8 +225,8 @@ class _Run:
         if not self.objective.has_carried:
             last, best = (None, None), None
         words = "OK" if int(self.status.flags) == 0 else explanation(self.status, self._seen(), undetermined)
-        values = (back(self.best), back(self.last), value, self.best_iteration, history, *last, best)
-        return Fit(*values, self.status, reason, undetermined, words)
+        ends = (self.status, reason, undetermined, words)
+        return Fit(back(self.best), back(self.last), value, self.best_iteration, history, *last, best, *ends)
 
     def _undetermined(self, reason: StopReason, started: PyTree) -> Undetermined | None:
         """What the data leave open: by the Jacobian of least squares, else by gradients that were always zero."""
@@ -241,7 +241,7 @@ class _Run:
 
     def _seen(self) -> Seen:
         index = len(self.history["loss"]) - 1
-        bad = () if self.report is None else self.report.checks.bad_gradients
+        bad = np.zeros(0, bool) if self.report is None else self.report.checks.bad_gradients
         return Seen(self.objective, self.last, self.now.carried, index, self.history["loss"][index], bad)
 
     def _advance(self) -> Report:

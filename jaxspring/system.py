@@ -55,8 +55,8 @@ class Motion(eqx.Module):
     """Nodes moved by a schedule.
 
     Attributes:
-        moved: bool, node shape: which nodes follow the schedule.
-        path: (time [s]) -> `Vector` of positions in node shape [m]; its derivative in time is the velocity.
+        moved: bool, (N,) in the user's order, on a lattice also its shape: which nodes follow the schedule.
+        path: (time [s]) -> `Vector` of positions [m], made by `net.vector_field` from (N, D); its derivative in time is the velocity.
     """
 
     moved: Array = eqx.field(converter=kept)
@@ -111,7 +111,7 @@ class System(eqx.Module):
         self.motion = motion
         if motion is not None:
             moved = as_mask("motion.moved", motion.moved, ", True where a node follows the schedule")
-            has_shape("motion.moved", moved, {"node shape": net.node_shape})
+            has_shape("motion.moved", moved, {"one per node": (net.n_nodes,), "node shape": net.node_shape})
 
     def __getstate__(self) -> dict[str, Any]:
         """What pickle stores. Raises PicklingError for a lambda, naming its field."""
@@ -299,12 +299,19 @@ class System(eqx.Module):
         if self.motion is None:
             return state
         position, velocity = self.motion.at(state.time)
-        moved = self.motion.moved
+        moved = self.moved_nodes
 
         def pick(new: Vector, old: Vector) -> Vector:
             return old.map(lambda a, b: jnp.where(moved, b.astype(a.dtype), a), new)
 
         return eqx.tree_at(lambda s: (s.position, s.velocity), state, (pick(position, state.position), pick(velocity, state.velocity)))
+
+    @property
+    def moved_nodes(self) -> Array:
+        """Which nodes follow a schedule, bool, node shape."""
+        if self.motion is None:
+            return jnp.zeros(self.net.node_shape, bool)
+        return self.net.node_field(self.motion.moved, "motion.moved")
 
     def stage(self, state: State) -> State:
         """A state within a step with moved nodes where their schedule has them at its time: at their place of the step's start, a
@@ -337,7 +344,7 @@ class System(eqx.Module):
             raise ValueError(f"free has {len(free)} coordinates, the state has {dim}.")
         if self.motion is None:
             return free
-        still = ~self.motion.moved
+        still = ~self.moved_nodes
         return tuple(still if m is None else m & still for m in free)
 
 

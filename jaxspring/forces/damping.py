@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from .._checks import fits_nodes, node_values, nonnegative
+from .._checks import node_values, nonnegative
 from ..linalg.operators import Blocks, SpringBlocks, isotropic
 from ..numerics import cast_inexact, tiny
 from ..state import State
@@ -34,7 +34,7 @@ class Drag(Force):
     """Viscous drag on every node.
 
     Attributes:
-        gamma: [N s/m], one number, or a node array in node shape (make it with `net.node_field`).
+        gamma: [N s/m], one number, or (N,) in the user's order; on a lattice also its shape.
 
     Raises:
         ValueError: a negative or non-finite value.
@@ -48,15 +48,15 @@ class Drag(Force):
 
     def force(self, state: State) -> Vector:
         """-gamma v [N]."""
-        return -(fits_nodes("gamma", self.gamma, state) * state.velocity)
+        return -(self._gamma(state) * state.velocity)
 
     def damping_blocks(self, state: State) -> Blocks:
         """Gamma on the diagonal [N s/m]."""
-        return Blocks((isotropic(self.gamma, state.position),))
+        return Blocks((isotropic(self._gamma(state), state.position),))
 
     def incremental_potential(self, state: State, dt: Array) -> Array:
         """Dt gamma v^2 / 2, summed [J]."""
-        return jnp.sum(0.5 * dt * self.gamma.astype(state.dtype) * state.velocity.dot(state.velocity))
+        return jnp.sum(0.5 * dt * self._gamma(state).astype(state.dtype) * state.velocity.dot(state.velocity))
 
     def is_symmetric(self, state: State) -> bool:
         """Yes: it acts on each coordinate alone."""
@@ -68,15 +68,18 @@ class Drag(Force):
 
     def damping_bound(self, state: State) -> Array:
         """Gamma [N s/m]."""
-        return self.gamma.astype(state.dtype)
+        return self._gamma(state).astype(state.dtype)
 
     def damping_floor(self, state: State) -> Array:
         """Gamma [N s/m]."""
-        return self.gamma.astype(state.dtype)
+        return self._gamma(state).astype(state.dtype)
 
     def invalid(self) -> Array:
         """Whether gamma is negative or not finite."""
         return any_refused(self.gamma)
+
+    def _gamma(self, state: State) -> Array:
+        return state.layout.constant("gamma", self.gamma)
 
 
 class Dashpots(Force):

@@ -16,7 +16,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._checks import as_inexact, finite, fits_nodes, has_shape, node_values, nonnegative
+from .._checks import as_inexact, finite, has_shape, node_values, nonnegative
 from ..images.image import Image
 from ..images.sampling import Bilinear
 from ..images.surface import Surface
@@ -34,7 +34,7 @@ class DataSprings(Force):
 
     Attributes:
         image: the data d(x, y); its values have the unit of z [m].
-        stiffness: k_data [N/m], one number or a node array.
+        stiffness: k_data [N/m], one number, or (N,) in the user's order; on a lattice also its shape.
         sampling: how the image is read between pixels.
         conservative: add the in-plane part that makes the force the gradient of an energy.
     """
@@ -58,12 +58,12 @@ class DataSprings(Force):
     def force(self, state: State) -> Vector:
         """Pull toward the image [N]."""
         x, y, z = _coordinates(state)
-        fits_nodes("stiffness", self.stiffness, state)
+        k = self._stiffness(state)
         if not self.conservative:
             zero = jnp.zeros_like(z)
-            return Vector((zero, zero, self.stiffness * (_surface(self).value(x, y) - z)))
+            return Vector((zero, zero, k * (_surface(self).value(x, y) - z)))
         value, dx, dy = _surface(self).value_and_gradient(x, y)
-        pull = self.stiffness * (value - z)
+        pull = k * (value - z)
         return Vector((-pull * dx, -pull * dy, pull))
 
     def energy(self, state: State) -> Array | None:
@@ -72,11 +72,11 @@ class DataSprings(Force):
             return None
         x, y, z = _coordinates(state)
         error = _surface(self).value(x, y) - z
-        return jnp.sum(0.5 * self.stiffness * error * error)
+        return jnp.sum(0.5 * self._stiffness(state) * error * error)
 
     def stiffness_blocks(self, state: State, linearisation: Linearisation) -> Blocks:
         """Blocks k on z [N/m]; where conservative k g g' with g = grad (d - z). The image's slope (its curvature) is left out."""
-        k = self.stiffness.astype(state.dtype)
+        k = self._stiffness(state).astype(state.dtype)
         x, y, z = _coordinates(state)
         if self.conservative:
             _, dx, dy = _surface(self).value_and_gradient(x, y)
@@ -88,9 +88,9 @@ class DataSprings(Force):
         """k, or k (1 + |grad d|^2) where conservative [N/m]."""
         # The z-only law is triangular, with eigenvalues 0 and k. The conservative one is about k n n' with n = (-grad d, 1).
         if not self.conservative:
-            return self.stiffness.astype(state.dtype)
+            return self._stiffness(state).astype(state.dtype)
         _, dx, dy = _surface(self).value_and_gradient(*_coordinates(state)[:2])
-        return self.stiffness.astype(state.dtype) * (1 + dx * dx + dy * dy)
+        return self._stiffness(state).astype(state.dtype) * (1 + dx * dx + dy * dy)
 
     def diagnose(self, state: State) -> tuple[Finding, ...]:
         """OUTSIDE: nodes beyond the image's border."""
@@ -103,6 +103,9 @@ class DataSprings(Force):
     def invalid(self) -> Array:
         """Whether the stiffness is negative or not finite, or the image's spacing not positive."""
         return any_refused(self.stiffness) | any_not_positive(self.image.spacing)
+
+    def _stiffness(self, state: State) -> Array:
+        return state.layout.constant("stiffness", self.stiffness)
 
 
 class ImageAttraction(Force):

@@ -117,7 +117,7 @@ class _Kick(eqx.Module):
         if self.system.motion is None:
             return Vector.zeros_like(v)
         _, scheduled = self.system.motion.at(self.state.time + self.dt)
-        moved = self.system.motion.moved
+        moved = self.system.moved_nodes
         return v.map(lambda old, new: jnp.where(moved, new.astype(old.dtype) - old, jnp.zeros_like(old)), scheduled)
 
 

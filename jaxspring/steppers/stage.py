@@ -149,7 +149,7 @@ def known_velocities(system: System, origin: Vector, h: Array, time: Array) -> t
     if system.motion is None:
         return zero, None
     place, velocity = system.motion.at(time)
-    moved = system.motion.moved
+    moved = system.moved_nodes
     known = zero.map(lambda z, to, x: jnp.where(moved, ((to.astype(x.dtype) - x) / h), z), place, origin)
     return known, zero.map(lambda z, v: jnp.where(moved, v.astype(z.dtype), z), velocity)
 

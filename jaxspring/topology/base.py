@@ -46,6 +46,15 @@ class NodeLayout:
         """(N,) in the user's order -> node array."""
         return (flat if self.permutation is None else self.permutation.inward(flat)).reshape(self.shape)
 
+    def constant(self, name: str, value: Array) -> Array:
+        """A constant of the nodes as the user gave it, one number, (N,) in the user's order or on a lattice its shape, as a node array.
+
+        One number stays as it is. Raises ValueError for any other shape: it would be stretched over the nodes without a word.
+        """
+        count = math.prod(self.shape)
+        has_shape(name, value, {"one number": (), "one per node": (count,), "node shape": self.shape})
+        return self.unflatten(value) if value.shape == (count,) else value
+
 
 def about_middle(points: Any) -> Any:
     """(N, D) points of float64 where JAX has 32 bits: about their middle, for what no shift changes. All others as they are."""

@@ -351,7 +351,7 @@ def test_constants_of_nodes_fit_the_nodes():
         (js.DataSprings(image, np.ones((3, 1))), "stiffness"),
         (js.Gravity([0.0, 0.0, 1.0], np.ones((3, 1))), "mass"),
     ):
-        with pytest.raises(ValueError, match=rf"{name} has shape \(3, 1\); expected \(\) .*node_field"):
+        with pytest.raises(ValueError, match=rf"{name} has shape \(3, 1\); expected \(\)"):
             js.System(NET, 1.0, force).force(chain)
     with pytest.raises(ValueError, match="gamma has shape"):
         js.System(sheet, 1.0, js.Drag([1.0, 2.0])).force(js.State.from_points(sheet, sheet.grid(), np.ones((4, 2))))

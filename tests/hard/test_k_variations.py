@@ -76,8 +76,8 @@ def damped(d: Drawn, net):
         return js.Vector(tuple(net.node_field(jnp.asarray(a) + shift, "path") for a in where))
 
     springs = js.Springs(net, d.cast(20 + 10 * d.per_spring), at_rest(d))
-    dampers = (js.Dashpots(net, d.cast(0.2 + d.per_spring)), js.Rayleigh(0.1, 0.01), js.Drag(0.3))
-    moved = js.Motion(net.node_field(jnp.asarray(d.moved), "moved"), path)
+    dampers = (js.Dashpots(net, d.cast(0.2 + d.per_spring)), js.Rayleigh(0.1, 0.01), js.Drag(d.cast(0.2 + 0.2 * d.mass)))
+    moved = js.Motion(d.moved, path)
     return js.System(net, d.cast(d.mass), (springs, *dampers, js.Gravity([0.0, -9.81, 0.0])), free=d.free, motion=moved)
 
 
@@ -87,7 +87,9 @@ def over_an_image(d: Drawn, net):
     pixels = d.cast(np.sin(5 * columns + 1) + np.cos(4 * rows) * columns)
     image = js.Image(pixels, spacing=d.dtype(0.6), origin=d.cast(d.origin[:2]))
     springs = js.Springs(net, js.ImageStiffness(image, 5.0, 40.0, 1.0), at_rest(d))
-    return js.System(net, d.cast(d.mass), (springs, js.DataSprings(image, 3.0), js.ImageAttraction(image, 0.5), js.Drag(0.3)))
+    return js.System(
+        net, d.cast(d.mass), (springs, js.DataSprings(image, d.cast(2 + d.mass)), js.ImageAttraction(image, 0.5), js.Drag(0.3))
+    )
 
 
 def heated(d: Drawn, net):

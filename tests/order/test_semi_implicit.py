@@ -25,7 +25,7 @@ def chain(*damping):
 
 
 def drag(net, gamma=0.8):
-    return js.Drag(net.node_field(gamma * np.arange(1.0, 5.0)))
+    return js.Drag(gamma * np.arange(1.0, 5.0))
 
 
 def dashpots(net, damping=0.7):

@@ -24,7 +24,7 @@ def test_drag_is_minus_gamma_v(moving):
     """One drag for all nodes, and one per node."""
     net, state, gamma = moving
     np.testing.assert_array_equal(flat(net, js.Drag(0.3).force(state)), -0.3 * np.asarray(state.velocities))
-    per_node = js.Drag(net.node_field(gamma)).force(state)
+    per_node = js.Drag(gamma).force(state)
     np.testing.assert_array_equal(flat(net, per_node), -gamma[:, None] * np.asarray(state.velocities))
 
 

@@ -55,6 +55,7 @@ def test_k3_a_moved_node_costs_no_order(stepper, order, shaken):
 SOLVERS = [js.JaxCG(), js.CG(), js.JaxCG(preconditioner=js.Unpreconditioned())]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64], ids=["float32", "float64"])
 @pytest.mark.parametrize("stepper", [js.BackwardEuler(s) for s in SOLVERS] + [js.BackwardEuler(newton=True)], ids=range(4))
 def test_k4_one_node_falls_as_two_do(stepper, dtype):
@@ -89,7 +90,7 @@ def test_k4_one_number_is_solved_for(is_jitted):
 def test_k4_one_node_is_heated(scheme):
     """6 W into 3 J/K for 0.5 s: one kelvin, by every scheme."""
     net = js.Graph.from_edges(np.zeros((0, 2), int), 1)
-    heat = js.Heat(net, 3.0, np.zeros(0), scheme, source=js.HeatSource(net, 6.0))
+    heat = js.Heat(net, 3.0, np.zeros(0), scheme, source=6.0)
     run = js.rollout(js.System(net, 1.0, rules=heat), js.State.from_points(net, [[0.0]], temperature=300.0), js.Still(), 0.1, 5)
     assert run.status.describe() == "OK"
     np.testing.assert_allclose(run.state.temperature, 301.0, rtol=1e-12)
@@ -118,6 +119,7 @@ def _pulled(stepper, dt, stiffness=9.0):
     return jnp.stack([end.points[1, 0], end.velocities[1, 0]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "stepper", [js.SemiImplicit(), js.BackwardEuler(), js.BackwardEuler(newton=True), js.BDF2()], ids=["semi", "linear", "newton", "bdf2"]
 )
@@ -132,6 +134,7 @@ def test_k5_dt_of_zero_has_a_derivative(stepper):
     np.testing.assert_allclose(lanes[1], _pulled(stepper, 0.02), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_k5_jacobians_of_newton_steps_are_those_of_the_equations():
     """A chain of three nodes 1.1 m apart, k = 50: dx/dk of one backward Euler step by hand, with jacfwd, jacrev and batched tangents."""
     net = js.lattice(3)
@@ -159,6 +162,7 @@ def _loops(program, name="while"):
     return count
 
 
+@pytest.mark.slow
 def test_a_backward_pass_repeats_no_newton_iteration():
     """With `StoreStates`, a gradient holds the loops of one forward run and of one linear solve, which are fewer."""
 

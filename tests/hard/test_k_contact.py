@@ -234,9 +234,8 @@ def thrown(normals, order, n_steps=60, restitution=0.8, gravity=9.81, dt=0.02, v
     rng = np.random.default_rng(7)
     net, dim = js.lattice(40), normals.shape[1]
     down = -np.eye(dim)[-1]
-    points = rng.uniform(0.2, 1.0, (40, 1)) * (normals.sum(axis=0) / np.linalg.norm(normals.sum(axis=0))) + rng.normal(
-        scale=0.02, size=(40, dim)
-    )
+    inward = normals.sum(axis=0) / np.linalg.norm(normals.sum(axis=0))
+    points = rng.uniform(0.3, 1.0, (40, 1)) * inward + rng.normal(scale=1e-3, size=(40, dim))
     start = js.State.from_points(net, points, rng.normal(size=(40, dim)) if velocity is None else np.zeros((40, dim)))
     floors = tuple(js.Floor(np.zeros(dim), normals[i], restitution=restitution + 0.1 * i) for i in order)
     system = js.System(net, 1.0, js.Gravity(gravity * down), rules=floors)

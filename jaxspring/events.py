@@ -94,10 +94,16 @@ def _starting(condition: Condition, flow: Callable[[Any, Any, Any], Any], start:
 
     if not jnp.issubdtype(jax.eval_shape(at, t0, y0).dtype, jnp.floating):
         return condition
-    _, rate = jax.jvp(at, (t0, y0), (jnp.ones_like(t0), flow(t0, y0, args)))
+
+    def slope(t: Any, y: Any) -> Any:
+        return jax.jvp(at, (t, y), (jnp.ones_like(t), flow(t, y, args)))[1]
+
+    rate, bend = jax.jvp(slope, (t0, y0), (jnp.ones_like(t0), flow(t0, y0, args)))
     forward = jnp.sign(t1 - t0).astype(rate.dtype)
     least = jnp.asarray(float(jnp.finfo(rate.dtype).tiny), rate.dtype)
-    return Condition(condition.function, condition.as_state, lax.stop_gradient(least * jnp.sign(rate) * forward))
+    # What is let go at rest leaves by its acceleration, either way in time.
+    side = jnp.where(rate == 0, jnp.sign(bend), jnp.sign(rate) * forward)
+    return Condition(condition.function, condition.as_state, lax.stop_gradient(least * side))
 
 
 def _n_positional(names: Any) -> int:

@@ -28,7 +28,7 @@ def facts(value: Any, path: str = "") -> tuple[Fact, ...]:
 
     Of an array only shape and type, since its numbers may be traced; of one that is an option or that a function holds, its numbers too.
     """
-    return tuple(_facts(value, path, False, _DEPTH))
+    return tuple(_facts(value, path, False, _DEPTH, set()))
 
 
 def digest(found: tuple[Fact, ...]) -> str:
@@ -36,7 +36,7 @@ def digest(found: tuple[Fact, ...]) -> str:
     return hashlib.sha256(repr(found).encode()).hexdigest()[:32]
 
 
-def _facts(value: Any, path: str, is_fixed: bool, depth: int) -> Iterator[Fact]:
+def _facts(value: Any, path: str, is_fixed: bool, depth: int, seen: set[int]) -> Iterator[Fact]:
     if depth == 0:
         return
     if isinstance(value, jax.Array | np.ndarray):
@@ -48,22 +48,22 @@ def _facts(value: Any, path: str, is_fixed: bool, depth: int) -> Iterator[Fact]:
     elif isinstance(value, tuple | list):
         yield path, f"{type(value).__name__} of {len(value)}"
         for i, entry in enumerate(value):
-            yield from _facts(entry, f"{path}[{i}]", is_fixed, depth - 1)
+            yield from _facts(entry, f"{path}[{i}]", is_fixed, depth - 1, seen)
     elif isinstance(value, dict):
         for key in sorted(value, key=repr):
-            yield from _facts(value[key], f"{path}[{key!r}]", is_fixed, depth - 1)
+            yield from _facts(value[key], f"{path}[{key!r}]", is_fixed, depth - 1, seen)
     elif callable(value) and not dataclasses.is_dataclass(value):
-        yield from _of_function(value, path, depth)
+        yield from _of_function(value, path, depth, seen)
     else:
         yield path, _name(type(value))
         for name, part, fixed in _parts(value):
-            yield from _facts(part, f"{path}.{name}" if path else name, is_fixed or fixed, depth - 1)
+            yield from _facts(part, f"{path}.{name}" if path else name, is_fixed or fixed, depth - 1, seen)
 
 
 def _parts(value: Any) -> Iterator[tuple[str, Any, bool]]:
     """Fields of an object, and whether each is fixed when a program is compiled."""
     if not dataclasses.is_dataclass(value):
-        yield from ((name, part, True) for name, part in sorted(getattr(value, "__dict__", {}).items()))
+        yield from ((name, part, True) for name, part in sorted(_attributes(value).items()))
         return
     # An object that JAX does not know is a leaf, and as a whole fixed.
     is_tree = not any(leaf is value for leaf in jax.tree.leaves(value))
@@ -79,8 +79,15 @@ def _of_array(value: Any, is_fixed: bool) -> str:
     return f"{kind} {hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()[:16]}"
 
 
-def _of_function(function: Any, path: str, depth: int) -> Iterator[Fact]:
-    """Its name, its code and what it holds; what it reads from its module is taken to stay as it is."""
+def _attributes(value: Any) -> dict[str, Any]:
+    """What an object holds, by name, in `__dict__` or in slots."""
+    slots = (name for kind in type(value).__mro__ for name in np.atleast_1d(getattr(kind, "__slots__", ())).tolist())
+    held = {name: getattr(value, name) for name in slots if name not in ("__dict__", "__weakref__") and hasattr(value, name)}
+    return {**held, **getattr(value, "__dict__", {})}
+
+
+def _of_function(function: Any, path: str, depth: int, seen: set[int]) -> Iterator[Fact]:
+    """Its name, its code and what it holds: what it closes over, what it reads from its module, or its fields as an object."""
     name = getattr(function, "__qualname__", _name(type(function)))
     yield path, f"{name} {_of_code(function.__code__)}" if isinstance(function, types.FunctionType) else name
     if isinstance(function, functools.partial):
@@ -88,10 +95,27 @@ def _of_function(function: Any, path: str, depth: int) -> Iterator[Fact]:
     elif isinstance(function, types.MethodType):
         inner = (function.__func__, function.__self__)
     elif isinstance(function, types.FunctionType):
-        inner = (function.__defaults__, function.__kwdefaults__, tuple(_content(cell) for cell in function.__closure__ or ()))
+        if id(function) in seen:  # told already, or calling itself
+            return
+        seen.add(id(function))
+        closed = tuple(_content(cell) for cell in function.__closure__ or ())
+        inner = (function.__defaults__, function.__kwdefaults__, closed, _read_from_module(function))
+    elif isinstance(function, types.BuiltinFunctionType):
+        inner = None
     else:
-        inner = getattr(function, "__wrapped__", None)
-    yield from _facts(inner, f"{path}()", True, depth - 1)
+        inner = (_attributes(function), vars(type(function)).get("__call__"))
+    yield from _facts(inner, f"{path}()", True, depth - 1, seen)
+
+
+def _read_from_module(function: types.FunctionType) -> dict[str, Any]:
+    """The values that a function reads from its module by name. Modules and classes, and functions of other modules, stay as they are."""
+    held = {name: function.__globals__[name] for name in function.__code__.co_names if name in function.__globals__}
+    fixed = types.ModuleType | type | types.BuiltinFunctionType
+    return {
+        name: value
+        for name, value in held.items()
+        if not isinstance(value, fixed) and getattr(value, "__module__", function.__module__) in (function.__module__, None)
+    }
 
 
 def _of_code(code: types.CodeType) -> str:

@@ -15,6 +15,7 @@ from jaxtyping import Array
 
 from ._checks import as_inexact, finite, has_shape, positive, triangle_indices
 from .topology.base import Topology, about_middle
+from .topology.periods import box_of, check_dim, nearest_image
 
 
 def lumped_mass(net: Topology, points: Any, density: Any, triangles: Any = None) -> Array:
@@ -44,7 +45,16 @@ def lumped_mass(net: Topology, points: Any, density: Any, triangles: Any = None)
         return net.flatten_nodes(net.incident_sum(net.split(0.5 * density * lengths)))
     corners = triangle_indices("triangles", triangles, net.n_nodes)
     a, b, c = (points[corners[:, i]] for i in range(3))
-    u, v = b - a, c - a
+    u, v = (_nearest(net, side) for side in (b - a, c - a))
     squared = jnp.sum(u * u, axis=1) * jnp.sum(v * v, axis=1) - jnp.sum(u * v, axis=1) ** 2
     share = density * jnp.sqrt(jnp.maximum(squared, jnp.zeros((), squared.dtype))) / 6
     return jnp.zeros(net.n_nodes, points.dtype).at[corners.ravel()].add(jnp.repeat(share, 3))
+
+
+def _nearest(net: Topology, side: Array) -> Array:
+    """(T, D) sides of triangles, through the walls of the net's box where that is nearer."""
+    box = box_of(net)
+    if box is None:
+        return side
+    check_dim(box, side.shape[1])
+    return jnp.stack([nearest_image(side[:, i], period) for i, period in enumerate(box)], axis=1)

@@ -176,6 +176,12 @@ def _reduce_lanes(args: tuple[Array], dims: tuple[int]) -> tuple[list[Array], li
 _any_lane = new_primitive("jaxspring_any_lane", lambda flag: [flag], lambda flag: [ShapedArray(flag.shape, flag.dtype)], _reduce_lanes)
 
 
+def power_of_two(size: Array) -> Array:
+    """The power of two at or below each number, and 1/2 for zero: what is divided by it keeps all its digits. A constant to derivatives."""
+    _, exponent = jnp.frexp(jax.lax.stop_gradient(size))
+    return jnp.ldexp(jnp.ones_like(size), exponent - 1)
+
+
 def cast_inexact(tree: PyTree, dtype: Any) -> PyTree:
     """Cast every inexact array leaf of `tree` to `dtype`, leaving integers, booleans and non-arrays alone."""
 
@@ -210,6 +216,7 @@ __all__ = [
     "lanes_first",
     "linear_call",
     "new_primitive",
+    "power_of_two",
     "stopped",
     "tied",
     "tiny",

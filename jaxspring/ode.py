@@ -27,7 +27,7 @@ from .state import State
 from .status import Flag, Status
 from .system import System
 from .vector import Vector
-from .watch import Carry, begin, look
+from .watch import Carry, Precision, begin, look
 
 if TYPE_CHECKING:
     import diffrax
@@ -185,7 +185,8 @@ def _solve(
     ready = system.prepare(state.dtype)
     # A list of neighbours is kept up to date by rollout alone: without one each evaluation makes its own.
     start = ready.constrain(dataclasses.replace(state, neighbours=None))
-    before = begin(system, ready, Carry(start, None, jnp.zeros((), jnp.int32)), jnp.zeros((), state.dtype), None)
+    first = Carry(start, None, jnp.zeros((), jnp.int32))
+    before = begin(system, ready, Precision.of(ready, start), first, jnp.zeros((), state.dtype), None)
     end = diffrax.SubSaveAt(t1=True)
     scene = _Scene(ready, dataclasses.replace(start, position=None, velocity=None))
     y0 = (start.position, start.velocity)

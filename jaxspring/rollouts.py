@@ -23,6 +23,7 @@ from jaxtyping import Array
 
 from ._checks import as_inexact, finite, has_shape, is_concrete
 from .blocks import Adjoint, Checkpointed, Plan, make_plan, run_blocks
+from .facts import digest, facts
 from .linalg.base import SolveInfo
 from .numerics import is_traced, stopped
 from .progress import LONG_RUN, N_CHUNKS, Progress
@@ -59,6 +60,7 @@ class _Job(eqx.Module):
     observe: Callable[[State], Any] | None
     plan: Plan = eqx.field(static=True)
     keep_solves: bool = eqx.field(static=True)
+    functions: str = eqx.field(static=True)
 
     def keep(self, carry: Carry) -> tuple[Any, SolveInfo | None]:
         """What a frame holds."""
@@ -138,7 +140,7 @@ def rollout(
     plan = make_plan(n_steps, save_every, Checkpointed() if adjoint is None else adjoint, check_every)
     if resume is not None:
         check_kind(resume)
-    job = _Job(stepper, dt, observe, plan, keep_solves)
+    job = _Job(stepper, dt, observe, plan, keep_solves, _functions(system, observe))
     if is_traced(system, state, resume, job):
         return _compiled(system, state, resume, job, progress)
     result = _run_eagerly(system, state, resume, job, progress)
@@ -343,12 +345,18 @@ def _joined(first: Result, latest: Result) -> Info:
     return Info(first.info.stable_dt, latest.info.n_steps, solves, latest.info.solves_saved)
 
 
+def _functions(*trees: Any) -> str:
+    """What the functions in a scene hold, as text, by which a program is told from one of the same functions that held something else."""
+    held = [leaf for leaf in jax.tree.leaves(trees) if callable(leaf)]
+    return digest(facts(held)) if held else ""
+
+
 def _checked_dt(dt: Any, state: State, stepper: Stepper) -> Array:
     dt = as_inexact("dt", dt, state.checked().dtype)
     has_shape("dt", dt, {"one number": ()})
     if is_concrete(dt):
         finite("dt", dt)
-        if dt < 0 and not stepper.runs_backward:
+        if np.asarray(dt) < 0 and not stepper.runs_backward:
             raise ValueError(f"dt = {dt}, but {type(stepper).__name__} does not run backward. Use VelocityVerlet(), or a positive dt.")
     return dt
 

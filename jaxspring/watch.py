@@ -18,14 +18,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from .forces.base import SPOILT
 from .linalg.base import SolveInfo
 from .numerics import any_lane, cast_inexact, stopped
 from .state import State
 from .status import NOWHERE, Flag, Status
 from .system import System
-
-# Forces good to three digits or worse: the threshold is a choice.
-_SPOILT = 1e-3
 
 
 class Solves(eqx.Module):
@@ -101,10 +99,10 @@ class Precision(eqx.Module):
             if error is None:
                 continue
             # NaN, where all coordinates were zero, counts as near.
-            is_near = any_lane(~(error * grown <= _SPOILT / 10))
+            is_near = any_lane(~(error * grown <= SPOILT / 10))
             force, nothing = ready.forces[i], jnp.zeros_like(error)
             now = lax.cond(is_near, lambda state, force=force: force.rounding(state), lambda _, none=nothing: none, carry.state)
-            status = status.then(Status.when(Flag.PRECISION, now > _SPOILT, step=carry.step, effect=i))
+            status = status.then(Status.when(Flag.PRECISION, now > SPOILT, step=carry.step, effect=i))
         return status
 
 
@@ -120,6 +118,7 @@ def begin(system: System, ready: System, precise: Precision, carry: Carry, dt: A
     status = Status.when(Flag.INVALID, ~jnp.all(system.mass > 0), step=carry.step)
     status = status.then(Status.when(Flag.NONFINITE, _has_nonfinite(system.mass), step=carry.step))
     status = status.then(Status.when(Flag.NONFINITE, ~jnp.isfinite(carry.state.time), step=carry.step))
+    status = status.then(Status.when(Flag.INVALID, ~jnp.isfinite(dt), step=carry.step))
     for i, effect in enumerate(system.parts):
         bad = effect.invalid()
         if bad is not None:
@@ -127,7 +126,7 @@ def begin(system: System, ready: System, precise: Precision, carry: Carry, dt: A
         status = status.then(Status.when(Flag.NONFINITE, _has_nonfinite(effect), step=carry.step, effect=i))
         error = precise.errors[i] if i < len(precise.errors) else None
         if error is not None:
-            status = status.then(Status.when(Flag.PRECISION, error > _SPOILT, step=carry.step, effect=i))
+            status = status.then(Status.when(Flag.PRECISION, error > SPOILT, step=carry.step, effect=i))
     status = status.then(look(ready, carry))
     if limit is not None:
         # A hair of slack: a dt set to the limit itself is not above it after rounding.

@@ -78,7 +78,7 @@ class ImageStiffness(StiffnessRule):
         for name, value in (("k_min", self.k_min), ("k_max", self.k_max), ("sigma", self.sigma)):
             has_shape(name, value, {"one number": ()})
             nonnegative(name, value, "Neither a stiffness nor a width can be negative.")
-        if is_concrete(self.k_min) and is_concrete(self.k_max) and self.k_min > self.k_max:
+        if is_concrete(self.k_min) and is_concrete(self.k_max) and np.asarray(self.k_min) > np.asarray(self.k_max):
             raise ValueError(f"k_min = {self.k_min} is above k_max = {self.k_max}. Swap them.")
         self.observation = GradientMagnitude() if observation is None else observation
         self.sampling = Bilinear() if sampling is None else sampling

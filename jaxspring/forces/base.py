@@ -24,6 +24,9 @@ from ..status import Flag, Status
 from ..vector import Vector
 from .linearisation import Linearisation
 
+# Share of a force that rounding may take before PRECISION is told: three digits are left. The threshold is a choice.
+SPOILT = 1e-3
+
 
 class Finding(eqx.Module):
     """Something an effect has to report about a state.

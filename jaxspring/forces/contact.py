@@ -12,6 +12,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array
 
@@ -59,7 +60,7 @@ class Floor(Rule):
         for name, value in (("friction", self.friction), ("restitution", self.restitution)):
             has_shape(name, value, {"one number": ()})
             nonnegative(name, value, "It would feed energy in.")
-        if is_concrete(self.restitution) and self.restitution > 1:
+        if is_concrete(self.restitution) and np.asarray(self.restitution) > 1:
             raise ValueError(f"restitution = {self.restitution} throws nodes back faster than they came. Pass 0 to 1.")
 
     @property

@@ -17,6 +17,7 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from .._checks import constant, is_concrete
@@ -134,7 +135,7 @@ class Switched(Cutoff):
 
     def __init__(self, on: Any, off: Any):
         self.on, self.off = constant("on", on, NOTHING_LEFT), constant("off", off, NOTHING_LEFT)
-        if is_concrete(self.on) and is_concrete(self.off) and not bool(self.on < self.off):
+        if is_concrete(self.on) and is_concrete(self.off) and not np.asarray(self.on) < np.asarray(self.off):
             raise ValueError(f"on = {self.on} is not below off = {self.off}: the force would be switched off before it begins to fade.")
 
     @property

@@ -115,7 +115,7 @@ class Fluid(Force):
         if box is None:
             return self
         for name, value in self._within_half().items():
-            if is_concrete(value) and is_concrete(box) and bool(jnp.any(_is_beyond_half(value, box))):
+            if is_concrete(value) and is_concrete(box) and np.any(_is_beyond_half(np.asarray(value), np.asarray(box))):
                 most = float(np.min(np.asarray(box)[np.asarray(box) > 0])) / 2
                 raise ValueError(
                     f"{name} = {value} m is beyond half a period of box = {np.asarray(box)} m: a particle would reach two images of "
@@ -256,7 +256,7 @@ class Fluid(Force):
                 )
             return
         for name, value in self._within_reach().items():
-            if is_concrete(value) and is_concrete(reach) and bool(_is_beyond(value, reach)):
+            if is_concrete(value) and is_concrete(reach) and _is_beyond(np.asarray(value), np.asarray(reach)):
                 raise ValueError(f"{name} = {value} m is beyond the cut-off, {reach} m. Unchecked, pairs between the two would be dropped.")
 
     def _sum(self, state: State, term: Callable[..., Fields], n: int, with_velocity: bool = False) -> Fields:

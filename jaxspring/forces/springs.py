@@ -14,6 +14,7 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from .._arrays import whole_number
@@ -208,7 +209,7 @@ class Springs(Force):
         in_box = long_springs(self._near(), self._seen(state), living(self.net, state))
         is_linear = isinstance(self.law, Hooke | TensionOnly)
         given = state.rest_length is None and is_concrete(self.rest_length) and is_linear
-        if given and not jnp.any(self.rest_length > 0):
+        if given and not np.any(np.asarray(self.rest_length) > 0):
             # A pull k d takes no square.
             return in_box
 

@@ -16,13 +16,13 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from .._arrays import given, own
 from .._checks import as_inexact, shape_of
+from ..numerics import power_of_two
 from .sampling import Bilinear, Sampling
 from .surface import Surface
 
@@ -105,12 +105,6 @@ def of_order_one(values: Array) -> Array:
     # In two steps, since the reciprocal of the largest float32 is no normal number.
     values = values / 16
     return values / power_of_two(jnp.max(jnp.abs(values)))
-
-
-def power_of_two(size: Array) -> Array:
-    """The power of two at or below each number, and 1/2 for zero: what is divided by it keeps all its digits. A constant to derivatives."""
-    _, exponent = jnp.frexp(lax.stop_gradient(size))
-    return jnp.ldexp(jnp.ones_like(size), exponent - 1)
 
 
 def _per_axis(name: str, value: PerAxis, dtype: jnp.dtype, must_be_positive: bool = False) -> tuple[Array, Array]:

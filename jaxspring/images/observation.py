@@ -25,7 +25,8 @@ from jaxtyping import Array
 
 from .._arrays import given
 from .._checks import as_inexact, finite, has_shape
-from .image import Image, of_order_one, power_of_two
+from ..numerics import power_of_two
+from .image import Image, of_order_one
 from .smoothing import Length, smooth
 
 # One program instead of a dozen where a function is called outside `jit`; inside, it leaves no trace.

@@ -20,7 +20,7 @@ import optimistix
 from jaxtyping import Array
 
 from ..files import leaf_name
-from ..numerics import cast_inexact
+from ..numerics import cast_inexact, power_of_two
 
 PyTree = Any
 # (free parameters, carried) -> (value or residuals, (carried, info))
@@ -182,8 +182,11 @@ class LBFGS(Optimiser):
 class LeastSquares(Optimiser):
     """Levenberg-Marquardt: the loss function returns residuals (an array or a tree of arrays), and half their sum of squares is minimised.
 
+    Parameters count in units of their size at the start (the largest of each array; 1 where all are zero), and residuals in units of
+    theirs, so that the damping and the tolerances mean the same whatever the units are.
+
     Attributes:
-        rtol, atol: stop where an accepted step changes parameters and residuals by less (relative and absolute, static).
+        rtol, atol: stop where an accepted step changes parameters and residuals by less (relative and absolute, in those units, static).
         by_reverse_mode: differentiate the residuals in reverse instead of forward mode: cheaper with more parameters than residuals
             (static).
 
@@ -201,30 +204,38 @@ class LeastSquares(Optimiser):
     def init(self, objective: Objective, free: PyTree, carried: PyTree) -> PyTree:
         """Arrays of the solver's state."""
         with _loose():
-            return jax.tree.leaves(eqx.filter(self._fresh(objective, free, carried), eqx.is_array))
+            units = _Units.of(objective, free, carried)
+            state = self._fresh(units.objective(objective), units.inward(free), carried)
+            return units, jax.tree.leaves(eqx.filter(state, eqx.is_array))
 
     def step(self, objective: Objective, free: PyTree, memory: PyTree, carried: PyTree) -> Evaluation:
         """One evaluation; the point moves only where the sum of squares fell."""
         with _loose():
+            units, _ = memory
             state = self._state(objective, free, memory, carried)
             solver, options = self._solver()
-            at, state, _ = solver.step(objective, free, carried, options, state, frozenset())
-        value = 0.5 * jnp.sum(jnp.stack([jnp.sum(r * r) for r in jax.tree.leaves(state.f_info.residual)]))
+            at, state, _ = solver.step(units.objective(objective), units.inward(free), carried, options, state, frozenset())
+        value = 0.5 * units.residual**2 * jnp.sum(jnp.stack([jnp.sum(r * r) for r in jax.tree.leaves(state.f_info.residual)]))
+        gradient = jax.tree.map(lambda g, u: g / u * units.residual**2, state.f_info.compute_grad(), units.free)
         carried, info = state.aux
-        memory = jax.tree.leaves(eqx.filter(state, eqx.is_array))
-        return Evaluation(at, value, state.f_info.compute_grad(), at, memory, carried, info, state.terminate)
+        at, memory = units.outward(at), (units, jax.tree.leaves(eqx.filter(state, eqx.is_array)))
+        return Evaluation(at, value, gradient, at, memory, carried, info, state.terminate)
 
     @eqx.filter_jit
     def linearised(self, objective: Objective, free: PyTree, memory: PyTree, carried: PyTree) -> tuple[Array, Array] | None:
         """Those of the last accepted step."""
         with _loose():
+            units, _ = memory
             found = self._state(objective, free, memory, carried).f_info
-            return jnp.concatenate([jnp.ravel(r) for r in jax.tree.leaves(found.residual)]), found.jac.as_matrix()
+            residual = jnp.concatenate([jnp.ravel(r) for r in jax.tree.leaves(found.residual)]) * units.residual
+            columns = jnp.concatenate([jnp.full(jnp.size(p), u) for p, u in zip(*map(jax.tree.leaves, (free, units.free)), strict=True)])
+            return residual, found.jac.as_matrix() * (units.residual / columns)[None, :]
 
     def _state(self, objective: Objective, free: PyTree, memory: PyTree, carried: PyTree) -> Any:
         # The solver's state holds a traced program, compared by identity: only its arrays leave a step, and a fresh state gives the rest.
-        fresh_arrays, program = eqx.partition(self._fresh(objective, free, carried), eqx.is_array)
-        return eqx.combine(jax.tree.unflatten(jax.tree.structure(fresh_arrays), memory), program)
+        units, arrays = memory
+        fresh_arrays, program = eqx.partition(self._fresh(units.objective(objective), units.inward(free), carried), eqx.is_array)
+        return eqx.combine(jax.tree.unflatten(jax.tree.structure(fresh_arrays), arrays), program)
 
     def _solver(self) -> tuple[Any, dict[str, Any]]:
         return optimistix.LevenbergMarquardt(self.rtol, self.atol), {"jac": "bwd" if self.by_reverse_mode else "fwd"}
@@ -236,6 +247,50 @@ class LeastSquares(Optimiser):
         state = solver.init(objective, free, carried, options, residual, aux, frozenset())
         # The damping starts as a float of JAX's own width; it must not widen the parameters.
         return eqx.tree_at(lambda s: s.search_state, state, cast_inexact(state.search_state, jax.tree.leaves(free)[0].dtype))
+
+
+class _Units(eqx.Module):
+    """The sizes of parameters and residuals at the start, as powers of two, so that to divide by them rounds nothing.
+
+    Attributes:
+        free: one number for each array of parameters.
+        residual: the norm of all residuals together.
+    """
+
+    free: PyTree
+    residual: Array
+
+    @staticmethod
+    def of(objective: Objective, free: PyTree, carried: PyTree) -> _Units:
+        """Where a fit starts."""
+        residual, _ = objective(free, carried)
+        largest = jnp.max(jnp.stack([jnp.max(jnp.abs(r), initial=0.0).astype(float) for r in jax.tree.leaves(residual)]))
+        dtype = jax.tree.leaves(residual)[0].dtype
+        sizes = jax.tree.map(lambda p: _unit(jnp.max(jnp.abs(p), initial=0.0)).astype(p.dtype), free)
+        return _Units(sizes, _unit(largest).astype(dtype))
+
+    def inward(self, free: PyTree) -> PyTree:
+        """Parameters in units of their sizes."""
+        return jax.tree.map(lambda p, u: p / u, free, self.free)
+
+    def outward(self, scaled: PyTree) -> PyTree:
+        """And back."""
+        return jax.tree.map(lambda p, u: p * u, scaled, self.free)
+
+    def objective(self, objective: Objective) -> Objective:
+        """The same residuals, in their unit, as a function of the parameters in theirs."""
+
+        def of_scaled(scaled: PyTree, carried: PyTree) -> tuple[PyTree, PyTree]:
+            residual, aux = objective(self.outward(scaled), carried)
+            return jax.tree.map(lambda r: r / self.residual.astype(r.dtype), residual), aux
+
+        return of_scaled
+
+
+def _unit(size: Array) -> Array:
+    """The power of two at or below a size; 1 for zero, and for what is not finite."""
+    one = jnp.ones_like(size)
+    return power_of_two(jnp.where(jnp.isfinite(size) & (size > 0), size, one))
 
 
 def as_optimiser(optimiser: Any) -> Optimiser:

@@ -23,6 +23,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from ..forces.base import SPOILT
 from ..forces.linearisation import Tangent
 from ..linalg.base import SolveInfo
 from ..linalg.exact import Converged, ExactSolver
@@ -286,7 +287,7 @@ def _find(search: _Search, system: System, state: State) -> Equilibrium:
     scene = _Scene(ready, start.moved(anchor, Vector.zeros_like(anchor)))
     still = stopped(scene)
     end = search.run(still)
-    status = _status(still, end).then(_in_box(still, end))
+    status = _status(still, end).then(_in_box(still, end)).then(_precision(still, end))
     trust = jnp.where(status.is_ok, jnp.ones_like(end.goal), jnp.full_like(end.goal, jnp.nan))
     u = implicitly(_Balance(search.adjoint, trust), scene, end.u)
     relative = search.tolerance_for(end.goal.dtype) * norm(end.force) / jnp.where(end.goal > 0, end.goal, jnp.ones_like(end.goal))
@@ -318,6 +319,16 @@ def _in_box(scene: _Scene, end: _Progress) -> Status:
         for found in (*force.diagnose(state), *force.diagnose_since(scene.start, state)):
             if found.flag == Flag.BOX:
                 status = status.then(Status.when(found.flag, found.count > 0, effect=i, count=found.count))
+    return status
+
+
+def _precision(scene: _Scene, end: _Progress) -> Status:
+    """PRECISION where the coordinates are too large for the springs between them."""
+    status, state = Status.ok(), scene.at(end.u)
+    for i, force in enumerate(scene.system.forces):
+        error = force.rounding(state)
+        if error is not None:
+            status = status.then(Status.when(Flag.PRECISION, error > SPOILT, effect=i))
     return status
 
 

@@ -17,6 +17,7 @@ from typing import Any, ClassVar, Self
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from .._arrays import as_mask, own
@@ -259,7 +260,7 @@ class Radiation(ThermalBoundary):
         """
         self.nodes, self.layout = _mask(net, nodes), net.layout
         self.emissivity = _nonnegative(net, "emissivity", emissivity)
-        if is_concrete(self.emissivity) and bool(jnp.any(self.emissivity > 1)):
+        if is_concrete(self.emissivity) and np.any(np.asarray(self.emissivity) > 1):
             raise ValueError(
                 f"emissivity = {float(jnp.max(self.emissivity))}, but must be between 0 and 1: no surface radiates more than a black one. "
                 f"Pass a larger area if that is meant."

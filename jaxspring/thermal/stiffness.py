@@ -17,6 +17,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from .._checks import as_inexact, finite, has_shape, is_concrete, nonnegative, positive
@@ -63,7 +64,7 @@ class ThermalStiffness(StiffnessRule):
                 f"stiffness.families[{i}]" if isinstance(self.full, EdgeField) else "stiffness", entry, "It would push without bound."
             )
         self.softening, self.melting = _number("softening", softening), _number("melting", melting)
-        if is_concrete(self.softening) and is_concrete(self.melting) and not self.softening < self.melting:
+        if is_concrete(self.softening) and is_concrete(self.melting) and not np.asarray(self.softening) < np.asarray(self.melting):
             raise ValueError(
                 f"softening = {self.softening} K is not below melting = {self.melting} K. The stiffness falls between the two."
             )

@@ -30,7 +30,7 @@ def from_mesh(path: str | pathlib.Path, *, merge: float | None = None, reduction
 
     A spring joins the ends of every side of every triangle, and of every line (OBJ) or edge (PLY), once. Faces of more corners are cut into
     triangles. Vertices at one place are merged. Vertices that nothing uses are dropped, and so are faces that merging left fewer than three
-    corners.
+    corners; a triangle that stands twice, with either side up, counts once.
 
     Args:
         path: the file.
@@ -116,6 +116,9 @@ def _merged(path: pathlib.Path, raw: RawMesh, merge: float) -> tuple[np.ndarray,
     except CrossedPolygonError as error:
         raise ValueError(f"{path}: {error}, so no triangles cover it. Cut it into triangles in the program that wrote it.") from error
     triangles = triangles[(triangles != np.roll(triangles, 1, axis=1)).all(axis=1)]
+    # A face that stands twice, as where both of its sides were written, is one piece of the surface: it weighs once.
+    _, first = np.unique(np.sort(triangles, axis=1), axis=0, return_index=True)
+    triangles = triangles[np.sort(first)]
     lines = node[raw.lines]
     lines = lines[lines[:, 0] != lines[:, 1]]
     kept = np.unique(np.concatenate([triangles.ravel(), lines.ravel()]))

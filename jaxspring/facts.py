@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
@@ -74,7 +75,7 @@ def _parts(value: Any) -> Iterator[tuple[str, Any, bool]]:
 
 def _of_array(value: Any, is_fixed: bool) -> str:
     kind = f"{value.dtype}{tuple(value.shape)}"
-    if not is_fixed or isinstance(value, Tracer) or jax.dtypes.issubdtype(value.dtype, jax.dtypes.extended):
+    if not is_fixed or isinstance(value, Tracer) or jnp.issubdtype(value.dtype, jax.dtypes.extended):
         return kind
     return f"{kind} {hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()[:16]}"
 

@@ -316,13 +316,13 @@ def _run_eagerly(system: System, state: State, resume: Resume | None, job: _Job,
     so_far: tuple[Any, tuple[Any, ...], int] = (None, (), 0)
     try:
         for piece in pieces:
-            result, frames, done = so_far
-            latest = _compiled_proceed(begun if result is None else begun.at(result), replace(job, plan=piece))
+            before, frames, done = so_far
+            latest = _compiled_proceed(begun if before is None else begun.at(before), replace(job, plan=piece))
             if len(pieces) > 1 or progress is not None:
                 jax.block_until_ready(latest)
             frame = (latest.saved, latest.info.solves_saved)
-            if result is not None:
-                latest = eqx.tree_at(lambda r: (r.status, r.info), latest, (result.status.then(latest.status), _joined(result, latest)))
+            if before is not None:
+                latest = eqx.tree_at(lambda r: (r.status, r.info), latest, (before.status.then(latest.status), _joined(before, latest)))
             so_far = (latest, (*frames, frame), done + piece.n_steps)
             if progress is not None:
                 progress.update(so_far[2], plan.n_steps)
@@ -331,7 +331,8 @@ def _run_eagerly(system: System, state: State, resume: Resume | None, job: _Job,
             raise
         stopped_here = Status.when(Flag.INTERRUPTED, True, step=so_far[0].resume.step)
         so_far = (eqx.tree_at(lambda r: r.status, so_far[0], so_far[0].status.then(stopped_here)), *so_far[1:])
-    result, frames, _ = so_far
+    result: Any = so_far[0]
+    frames = so_far[1]
     if len(frames) > 1 and plan.save_every is not None:
         saved, solves_saved = jax.tree.map(lambda *parts: jnp.concatenate(parts), *frames)
         result = replace(result, saved=saved, info=replace(result.info, solves_saved=solves_saved))

@@ -293,12 +293,12 @@ class Fluid(Force):
         return jnp.broadcast_to(self.mass.astype(state.dtype), state.position.shape)
 
 
-def _is_beyond(distance: Array, reach: Array) -> Array:
+def _is_beyond(distance: Any, reach: Any) -> Any:
     """Whether a distance is beyond the reach; a cut-off at the distance itself is not, whatever its rounding."""
     coarser = max(float(jnp.finfo(value.dtype).eps) for value in (distance, reach))
     return distance > reach.astype(distance.dtype) * (1 + 8 * coarser)
 
 
-def _is_beyond_half(distance: Array, box: Array) -> Array:
+def _is_beyond_half(distance: Any, box: Any) -> Any:
     """(D,) whether a distance is beyond half of each period."""
     return (box > 0) & _is_beyond(distance, box / 2)

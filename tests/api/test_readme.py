@@ -17,10 +17,10 @@ def test_quick_start_is_two_commands():
     assert commands == ["python3 bootstrap.py fit", "python3 bootstrap.py test"]
 
 
-def test_the_check_of_every_change_ends_with_the_second_command():
-    """`.ci/run` runs what the README promises, to the letter."""
+def test_the_check_of_every_change_runs_the_second_command():
+    """`.ci/run` runs what the README promises, to the letter, and then the same suite on the newest jax."""
     lines = (source.ROOT / ".ci" / "run").read_text(encoding="utf-8").split("\n")
-    assert [line for line in lines if line][-1] == "python3 bootstrap.py test"
+    assert [line for line in lines if line][-2:] == ["python3 bootstrap.py test", "python3 bootstrap.py newest"]
 
 
 def test_first_example(user_mode, tmp_path, monkeypatch):

@@ -185,6 +185,7 @@ BY_HAND = {"diffeqsolve", "fit", "check_gradient", "frequency_response", "from_n
 MADE_INSIDE = """
     Account Blocks Energy Equilibrium Finding Fit Gather GradientCheck History Iteration Modes NodeDyads OdeInfo OdeResult Profile
     Result Resume Scatter Selection SkylineFactor SolveInfo Solves SpringBlocks SpringMatrix Status Surface Reconstructed
+    Undetermined
 """
 
 # Objects made of options, other objects, functions or files: no array of the user's enters.

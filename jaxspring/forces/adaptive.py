@@ -18,6 +18,7 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import numpy as np
 from jaxtyping import Array
 
 from .._arrays import given

@@ -56,6 +56,8 @@ class Image(eqx.Module):
     def __init__(self, values: ArrayLike, spacing: PerAxis = 1.0, origin: PerAxis = 0.0):
         self.values = _as_pixels(values)
         self.spacing = _per_axis("spacing", spacing, self.values.dtype, must_be_positive=True)
+        # A generator gives its numbers once, and they are looked at twice.
+        origin = origin if isinstance(origin, tuple | list) else given("origin", origin)
         self.origin = _per_axis("origin", origin, self.values.dtype)
         _check_place(origin, self.origin, self.spacing)
 

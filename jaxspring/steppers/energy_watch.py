@@ -56,7 +56,9 @@ class EnergyWatch(eqx.Module):
         parts = _parts(stage.system, state)
         # Work of the forces that rounding and an inexact solve leave over: a residual is relative to M v / h and the forces, whose work in
         # a step is at most twice the kinetic energy and what is exchanged.
-        of_positions = stage.rounding() * norm(state.position - stage.predictor.position)
+        # A scene at rest moves by the rounding of its places alone, against forces that are rounding too.
+        moved = norm(state.position - stage.predictor.position) + float(jnp.finfo(state.dtype).eps) * norm(state.position)
+        of_positions = stage.rounding() * moved
         of_solve = 2 * residual * (parts[0] + jnp.sum(jnp.abs(parts - self.parts)))
         return EnergyWatch(
             parts=parts,

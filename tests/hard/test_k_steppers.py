@@ -49,7 +49,8 @@ def test_k3_a_moved_node_costs_no_order(stepper, order, shaken):
         end = js.rollout(system, start, stepper, 0.4 / n, n).state
         return np.max(np.abs(np.concatenate([end.points[1:, 0], end.velocities[1:, 0]]) - shaken))
 
-    assert np.log2(error(20) / error(40)) == pytest.approx(order, abs=0.2)
+    n = 40 if isinstance(stepper, js.ForwardEuler) else 20  # below its limit
+    assert np.log2(error(n) / error(2 * n)) == pytest.approx(order, abs=0.2)
 
 
 SOLVERS = [js.JaxCG(), js.CG(), js.JaxCG(preconditioner=js.Unpreconditioned())]

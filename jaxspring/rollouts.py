@@ -161,7 +161,8 @@ def _warn(result: Result, dt: Array) -> None:
                 f"node became too hot. Lower dt, or widen the skin"
             )
         warnings.warn(f"DT_LIMIT: {text}.", StabilityWarning, stacklevel=3)
-    if bool(result.status.has(Flag.PRECISION)):
+    # A run that failed has grown too large as well, but that is not what was wrong.
+    if bool(result.status.has(Flag.PRECISION)) and bool(result.status.is_ok):
         warnings.warn(f"PRECISION: {EXPLANATION[Flag.PRECISION]}.", StabilityWarning, stacklevel=3)
 
 

@@ -159,18 +159,28 @@ def settle(advance: Callable[[Carry], Carry], first: Carry, status: Status, syst
 
     def replay(_: None) -> tuple[Array, Array, Array]:
         last, failed = lax.while_loop(
-            lambda pair: ~jnp.any(_nonfinite(pair[1].state)) & (pair[1].step < status.step),
+            lambda pair: ~_has_failed(system, pair[1].state) & (pair[1].step < status.step),
             lambda pair: (pair[1], advance(pair[1])),
             (first, first),
         )
         bad = jnp.ravel(_nonfinite(failed.state))
-        found = (failed.step, jnp.argmax(bad).astype(jnp.int32), _blame(system, last.state, failed.state))
-        # A spring may be too long for its square in a state that is finite.
-        return jax.tree.map(partial(jnp.where, jnp.any(bad)), found, known)
+        found = (jnp.argmax(bad).astype(jnp.int32), _blame(system, last.state, failed.state))
+        # A spring may be too long for its square in a state that is finite: then it is known already which force that was.
+        return failed.step, *jax.tree.map(partial(jnp.where, jnp.any(bad)), found, known[1:])
 
     has_failed = status.has(Flag.NONFINITE) & (status.step > first.step)
     step, node, effect = lax.cond(has_failed, replay, lambda _: known, None)
     return lax.stop_gradient(Status(status.flags, step, node, effect, status.count))
+
+
+def _has_failed(system: System, state: State) -> Array:
+    """Whether a state is not finite, or a force says so of what it makes of the state."""
+    failed = jnp.any(_nonfinite(state))
+    for effect in system.parts:
+        for found in effect.diagnose(state):
+            if found.flag == Flag.NONFINITE:
+                failed = failed | (found.count > 0)
+    return failed
 
 
 def _blame(system: System, state: State, failed: State) -> Array:

@@ -52,7 +52,8 @@ def test_c1_just_above_the_limit(rng, stepper):
     assert result.status.has(Flag.NONFINITE)
     step = int(result.status.step)
     # The growth per step at w dt = 2.02 is acosh(2 * 1.01^2 - 1) = 0.2826 for both steppers; the run also needs time to start and to fold.
-    assert np.log(1e308) / 0.2826 < step < np.log(1e308) / 0.2826 * 1.2
+    # It fails where the square of a length leaves float64.
+    assert np.log(1e154) / 0.2826 < step < np.log(1e154) / 0.2826 * 1.3
     with pytest.raises(js.SimulationError, match=rf"step {step}.*stability limit of this run was dt = 0\.01\."):
         js.raise_for_status(result)
     with warnings.catch_warnings():

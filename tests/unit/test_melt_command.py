@@ -12,6 +12,7 @@ import pytest
 import jaxspring as js
 from jaxspring import cli
 from jaxspring.cli import main
+from jaxspring.scenes.melting import job
 from jaxspring.scenes.melting.scene import MeltSettings, melting_block
 
 
@@ -76,7 +77,7 @@ def check_interrupts(run, out, capsys, monkeypatch):
     """
     older = {path: path.read_bytes() for path in out.iterdir()}
     checkpoint = out.with_name("out.checkpoint.npz")
-    monkeypatch.setattr(js.scenes.melting.job, "seconds_per_effect", lambda *_: {})  # compiles each effect anew
+    monkeypatch.setattr(job, "seconds_per_effect", lambda *_: {})  # compiles each effect anew
 
     def interrupted_in(module, name, is_time, frames):
         usual = getattr(module, name)
@@ -96,7 +97,7 @@ def check_interrupts(run, out, capsys, monkeypatch):
 
     def resumed():
         with monkeypatch.context() as patch:
-            patch.setattr(js.scenes.melting.job, "draw_animation", lambda path, *_: path.touch())  # the slowest part
+            patch.setattr(job, "draw_animation", lambda path, *_: path.touch())  # the slowest part
             assert main([*run, "--resume"]) == 0
         assert not checkpoint.exists()
         reports = [json.loads(text) for text in (older[out / "report.json"], (out / "report.json").read_text())]
@@ -110,7 +111,7 @@ def check_interrupts(run, out, capsys, monkeypatch):
     assert main([*run, "--duration", "0.2", "--resume"]) == cli.UNUSABLE
     assert "its problem is" in capsys.readouterr().err
     resumed()
-    interrupted_in(js.scenes.melting.job, "draw_strip", lambda *_: True, 60)
+    interrupted_in(job, "draw_strip", lambda *_: True, 60)
     check_full_disk(run, out, capsys, monkeypatch)
     resumed()
 
@@ -122,7 +123,7 @@ def check_full_disk(run, out, capsys, monkeypatch):
         raise OSError("No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(js.scenes.melting.job, "draw_strip", full)
+        patch.setattr(job, "draw_strip", full)
         assert main([*run, "--resume"]) == cli.FAILED
     assert "could not be written (No space left on device); --resume" in capsys.readouterr().err
     assert out.with_name("out.checkpoint.npz").exists()
@@ -136,7 +137,7 @@ def test_what_draws_is_asked_for_before_the_work(command, missing, tmp_path, cap
     """Without matplotlib or Pillow both commands end at once, with code 2 and the name of the extra; nothing is computed or written."""
     np.save(tmp_path / "hill.npy", np.arange(30.0).reshape(5, 6))
     monkeypatch.setitem(sys.modules, missing, None)
-    monkeypatch.setattr(js.scenes.melting.job, "rollout", None)
+    monkeypatch.setattr(job, "rollout", None)
     image = [str(tmp_path / "hill.npy")] if command[0] == "fit" else []
     assert main([*command, *image, "--out", str(tmp_path / "out")]) == cli.UNUSABLE
     assert "pip install jaxspring[viz]" in capsys.readouterr().err

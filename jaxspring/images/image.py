@@ -57,9 +57,9 @@ class Image(eqx.Module):
         self.values = _as_pixels(values)
         self.spacing = _per_axis("spacing", spacing, self.values.dtype, must_be_positive=True)
         # A generator gives its numbers once, and they are looked at twice.
-        origin = origin if isinstance(origin, tuple | list) else given("origin", origin)
-        self.origin = _per_axis("origin", origin, self.values.dtype)
-        _check_place(origin, self.origin, self.spacing)
+        place: Any = origin if isinstance(origin, tuple | list) else given("origin", origin)
+        self.origin = _per_axis("origin", place, self.values.dtype)
+        _check_place(place, self.origin, self.spacing)
 
     @property
     def shape(self) -> tuple[int, int]:

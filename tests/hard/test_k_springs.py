@@ -466,7 +466,7 @@ def instances():
     matrix = system.matrix(system.stiffness_blocks(state, js.Tangent()) + js.Blocks((js.Vector((jnp.ones(2),)),)), state)
     direct = js.Skyline(TWO)
     ode = js.OdeInfo(whole, whole, whole, None, None)
-    fit = js.Fit({"k": number}, {"k": number}, 1.0, 3, js.History(*np.ones((3, 2))), None, None, None, status, js.StopReason.ITERATIONS)
+    fit = js.Fit({"k": number}, {"k": number}, 1.0, 3, js.History(*np.ones((3, 2))), None, None, None, status, js.StopReason.ITERATIONS, None, "")
     pixels = js.PixelSprings(None, 1.0)
     classes = [
         js.Account(number, number, number, number, number, number),

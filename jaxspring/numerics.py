@@ -10,7 +10,8 @@ other modules make their primitives with `new_primitive`.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
+from dataclasses import dataclass
+from functools import lru_cache, partial
 from typing import Any
 
 import equinox as eqx
@@ -44,23 +45,69 @@ def linear_call(
     """
     residual_leaves, residual_tree = tree_util.tree_flatten(residuals)
     operand_leaves, operand_tree = tree_util.tree_flatten(operand)
-    out_tree = tree_util.tree_structure(jax.eval_shape(forward, residuals, operand))
+    leaves = [jnp.asarray(leaf) for leaf in (*residual_leaves, *operand_leaves)]
+    there = _Flat(*_taken_apart(forward), residual_tree, operand_tree)
+    out_tree, _ = _outcome(there, leaves)
+    back = _Flat(*_taken_apart(transpose), residual_tree, out_tree)
+    return tree_util.tree_unflatten(out_tree, _linear_call.bind(*leaves, forward=there, transpose=back, n_residuals=len(residual_leaves)))
 
-    def flat(function, tree_in, *leaves):
-        out = function(
-            tree_util.tree_unflatten(residual_tree, leaves[: len(residual_leaves)]),
-            tree_util.tree_unflatten(tree_in, leaves[len(residual_leaves) :]),
-        )
-        return tree_util.tree_leaves(out)
 
-    out_leaves = _linear_call.bind(
-        *residual_leaves,
-        *operand_leaves,
-        forward=partial(flat, forward, operand_tree),
-        transpose=partial(flat, transpose, out_tree),
-        n_residuals=len(residual_leaves),
-    )
-    return tree_util.tree_unflatten(out_tree, out_leaves)
+@dataclass(frozen=True)
+class _Flat:
+    """A function of residuals and operand as one of their leaves; equal to another where the function, what it was given and the trees are."""
+
+    function: Callable[..., PyTree]
+    fixed: tuple[Any, ...]
+    residual_tree: Any
+    operand_tree: Any
+
+    def tree(self, *leaves: Array) -> PyTree:
+        """What the function makes of these leaves."""
+        n = self.residual_tree.num_leaves
+        residuals = tree_util.tree_unflatten(self.residual_tree, leaves[:n])
+        return self.function(*self.fixed, residuals, tree_util.tree_unflatten(self.operand_tree, leaves[n:]))
+
+    def __call__(self, *leaves: Array) -> list[Array]:
+        return tree_util.tree_leaves(self.tree(*leaves))
+
+
+@dataclass(frozen=True)
+class _Lanes:
+    """A function of leaves for every lane of a batch; None is the axis of what all lanes share."""
+
+    function: _Flat | _Lanes
+    residual_axes: tuple[int | None, ...]
+
+    def tree(self, *leaves: Array) -> PyTree:
+        """What the function makes of these leaves, lanes first."""
+        return jax.vmap(self.function.tree, in_axes=[*self.residual_axes, *[0] * (len(leaves) - len(self.residual_axes))])(*leaves)
+
+    def __call__(self, *leaves: Array) -> list[Array]:
+        return tree_util.tree_leaves(self.tree(*leaves))
+
+
+def _taken_apart(function: Callable[..., PyTree]) -> tuple[Callable[..., PyTree], tuple[Any, ...]]:
+    """The function under a `partial`, and what it was given: partials are equal to themselves alone."""
+    return (function.func, function.args) if isinstance(function, partial) else (function, ())
+
+
+def _outcome(function: _Flat | _Lanes, args: Sequence[Any]) -> tuple[Any, list[ShapedArray]]:
+    """The tree and the shapes of what a function makes of leaves like these: JAX asks for them again and again."""
+    like = tuple((a.shape, a.dtype) for a in args)
+    try:
+        hash(function)
+    except TypeError:
+        return _outcome_anew(function, like)
+    return _outcome_once(function, like, bool(jax.config.jax_enable_x64))
+
+
+def _outcome_anew(function: _Flat | _Lanes, like: tuple[Any, ...], is_x64: bool | None = None) -> tuple[Any, list[ShapedArray]]:
+    out = jax.eval_shape(function.tree, *(jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in like))
+    leaves, tree = tree_util.tree_flatten(out)
+    return tree, [ShapedArray(leaf.shape, leaf.dtype) for leaf in leaves]
+
+
+_outcome_once = lru_cache(maxsize=1024)(_outcome_anew)
 
 
 def _evaluate(*args, forward, transpose, n_residuals):
@@ -68,8 +115,7 @@ def _evaluate(*args, forward, transpose, n_residuals):
 
 
 def _abstract(*args, forward, transpose, n_residuals):
-    shapes = [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in args]
-    return [ShapedArray(out.shape, out.dtype) for out in jax.eval_shape(forward, *shapes)]
+    return _outcome(forward, args)[1]
 
 
 def _jvp(primals, tangents, *, forward, transpose, n_residuals):
@@ -106,16 +152,11 @@ def _batch(args, dims, *, forward, transpose, n_residuals):
     args, residual_axes = lanes_first(args, dims, n_residuals)
     out = _linear_call.bind(
         *args,
-        forward=partial(_over_lanes, forward, residual_axes),
-        transpose=partial(_over_lanes, transpose, residual_axes),
+        forward=_Lanes(forward, residual_axes),
+        transpose=_Lanes(transpose, residual_axes),
         n_residuals=n_residuals,
     )
     return out, [0] * len(out)
-
-
-def _over_lanes(function, residual_axes, *leaves):
-    in_axes = [*residual_axes, *[0] * (len(leaves) - len(residual_axes))]
-    return jax.vmap(function, in_axes=in_axes)(*leaves)
 
 
 def lanes_first(args: Sequence[Array], dims: Sequence[int | None], n_shared: int) -> tuple[list[Array], tuple[int | None, ...]]:
@@ -199,7 +240,11 @@ def stopped(tree: PyTree) -> PyTree:
 
 def tied(tree: PyTree) -> PyTree:
     """`tree`, every leaf of which counts as varying where one does: JAX's linear solve cannot be transposed for part of a right side."""
-    return linear_call(lambda _, operand: operand, lambda _, cotangent: cotangent, (), tree)
+    return linear_call(_operand, _operand, (), tree)
+
+
+def _operand(_: Any, operand: PyTree) -> PyTree:
+    return operand
 
 
 def is_traced(*trees: PyTree) -> bool:

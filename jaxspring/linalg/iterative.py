@@ -152,7 +152,7 @@ class IterativeSolver(LinearSolver):
     def _judge(self, matvec: Operator, unit: PyTree, size: Array, ended: Ended, tolerance: float) -> SolveInfo:
         """The true residual, and the worst of what can be said."""
         is_zero = size == 0
-        has_numbers = jnp.isfinite(norm(ended.x))
+        has_numbers = _reduced(jnp.logical_and, jnp.all, jax.tree.map(jnp.isfinite, ended.x))
         # Where the iteration broke down to NaN, one product with b tells whether the matrix holds NaN itself.
         image = matvec(_select(has_numbers, ended.x, unit))
         residual = norm(_minus(unit, image))

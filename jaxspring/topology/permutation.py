@@ -44,4 +44,12 @@ def _gather_pair(a: Array, forward: np.ndarray, backward: np.ndarray) -> Array:
     if not jnp.issubdtype(a.dtype, jnp.inexact):
         return a[..., forward]
     tables = (jnp.asarray(forward), jnp.asarray(backward))
-    return linear_call(lambda t, x: x[..., t[0]], lambda t, y: y[..., t[1]], tables, a)
+    return linear_call(_gather_first, _gather_second, tables, a)
+
+
+def _gather_first(tables: tuple[Array, Array], a: Array) -> Array:
+    return a[..., tables[0]]
+
+
+def _gather_second(tables: tuple[Array, Array], a: Array) -> Array:
+    return a[..., tables[1]]

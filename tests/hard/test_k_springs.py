@@ -19,6 +19,7 @@ import pytest
 import jaxspring as js
 from jaxspring.archive import HEADER
 from jaxspring.forces.laws import has_no_direction, is_beyond_range, spring_block, spring_energy, spring_pull
+from jaxspring.resume import Origin
 from jaxspring.thermal.ledger import Account
 
 # A triangle whose last spring is broken, and the same without it.
@@ -465,6 +466,7 @@ def instances():
     info = js.SolveInfo(number, whole, status)
     matrix = system.matrix(system.stiffness_blocks(state, js.Tangent()) + js.Blocks((js.Vector((jnp.ones(2),)),)), state)
     direct = js.Skyline(TWO)
+    resume = js.Resume(number, whole, whole, number, number, None, whole, whole, Origin.of(system, state, js.SymplecticEuler()))
     ode = js.OdeInfo(whole, whole, whole, None, None)
     fit = js.Fit({"k": number}, {"k": number}, 1.0, 3, js.History(*np.ones((3, 2))), None, None, None, status, js.StopReason.ITERATIONS, None, "")
     pixels = js.PixelSprings(None, 1.0)
@@ -498,9 +500,10 @@ def instances():
         *(WHOLE.reduction, js.Graph.from_edges([(0, 1)], 2, reduction=js.Scatter).reduction, js.lattice((3, 3)).named("second")),
         *(js.Energy(number, (None,)), js.Finding(js.Flag.OUTSIDE, whole, whole), js.Flag.OK, status, js.StopReason.ITERATIONS),
         *(js.Equilibrium(state, info, whole, status, ("Springs",)), js.Solves(whole, number, status, info)),
-        *(ode, js.OdeResult(state, None, number, status, ode, ("Springs",)), js.Resume(number, whole, None)),
-        js.Result(state, None, status, None, js.Resume(number, whole, None), ("Springs",)),
+        *(ode, js.OdeResult(state, None, number, status, ode, None, ("Springs",)), resume),
+        js.Result(state, None, status, None, resume, ("Springs",)),
         *(fit, fit.history, js.Iteration(1, 1.0, 1.0, 1.0, True, None, None, None, {"k": number}), js.GradientCheck((), 1.0, status)),
+        js.Undetermined(1, {"k": whole}, None, ("k",)),
     ]
     return {type(a).__name__: a for a in classes}
 

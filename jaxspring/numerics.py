@@ -54,7 +54,7 @@ def linear_call(
 
 @dataclass(frozen=True)
 class _Flat:
-    """A function of residuals and operand as one of their leaves; equal to another where the function, what it was given and the trees are."""
+    """A function of residuals and operand as one of their leaves; equal to another with the same function, arguments and trees."""
 
     function: Callable[..., PyTree]
     fixed: tuple[Any, ...]

@@ -100,6 +100,10 @@ class Vector(eqx.Module):
         one, zero = jnp.ones((), squared.dtype), jnp.zeros((), squared.dtype)
         return scale * jnp.where(is_zero, zero, jnp.sqrt(jnp.where(is_zero, one, squared)))
 
+    def largest(self) -> Array:
+        """Largest size of any coordinate; NaN where one is. One pass over the memory."""
+        return jnp.max(functools.reduce(jnp.maximum, (jnp.abs(a) for a in self)))
+
     def __iter__(self) -> Iterator[Array]:
         return iter(self.components)
 

@@ -85,7 +85,7 @@ class Precision(eqx.Module):
     @staticmethod
     def of(ready: System, state: State) -> Precision:
         """At the start of a run."""
-        return stopped(Precision(tuple(force.rounding(state) for force in ready.forces), _largest(state)))
+        return stopped(Precision(tuple(force.rounding(state) for force in ready.forces), state.position.largest()))
 
     def look(self, ready: System, carry: Carry) -> Status:
         """PRECISION where coordinates have grown too large for a force.
@@ -93,7 +93,7 @@ class Precision(eqx.Module):
         Springs are measured only where the coordinates come within a tenth of what the lengths at the start allow.
         """
         ready, carry = stopped((ready, carry))
-        grown = _largest(carry.state) / self.size
+        grown = carry.state.position.largest() / self.size
         status = Status.ok()
         for i, error in enumerate(self.errors):
             if error is None:
@@ -203,10 +203,6 @@ def _has_nonfinite(constants: Any) -> Array:
     for leaf in jax.tree.leaves(eqx.filter(constants, eqx.is_inexact_array)):
         bad = bad | ~jnp.all(jnp.isfinite(leaf))
     return bad
-
-
-def _largest(state: State) -> Array:
-    return jnp.max(jnp.stack([jnp.max(jnp.abs(a)) for a in state.position]))
 
 
 def _nonfinite(state: State) -> Array:

@@ -25,7 +25,8 @@ from ..topology.edge_field import EdgeField
 from ..vector import Vector
 from .base import Finding, Force, any_refused
 from .in_box import long_springs, turned_springs
-from .laws import has_no_direction, is_beyond_range
+from .laws import has_no_direction
+from .lengths import beyond_range
 from .living import counted, living, map_living
 from .springs import _check_sign, _edge_constant
 
@@ -138,13 +139,10 @@ class Dashpots(Force):
             is_apart = jnp.max(jnp.abs(jnp.stack(tuple(d))), axis=0) > 0
             return (has_no_direction(d) & is_apart).astype(jnp.int32)
 
-        def far(d: Vector) -> Array:
-            return is_beyond_range(d).astype(jnp.int32)
-
-        d, nowhere = self.net.difference(state.position), jnp.asarray(-1, jnp.int32)
-        counts = (self.net.sum(map_living(self.net, state, of_family, d)) for of_family in (near, far))
-        found = (Finding(flag, n, nowhere) for flag, n in zip((Flag.COINCIDENT, Flag.NONFINITE), counts, strict=True))
-        return (*found, *long_springs(self.net, state.position, living(self.net, state)))
+        d = self.net.difference(state.position)
+        blind = Finding(Flag.COINCIDENT, self.net.sum(map_living(self.net, state, near, d)), jnp.asarray(-1, jnp.int32))
+        far = beyond_range(self.net, state, state.position, d)
+        return (blind, far, *long_springs(self.net, state.position, living(self.net, state)))
 
     def diagnose_since(self, start: State, state: State) -> tuple[Finding, ...]:
         """BOX: dampers that act toward another image than at the start."""

@@ -177,8 +177,11 @@ class Fluid(Force):
 
     def rounding(self, state: State) -> Array:
         """The largest coordinate's rounding over the equilibrium distance."""
-        largest = jnp.max(jnp.stack([jnp.max(jnp.abs(a)) for a in state.position]))
-        return largest * jnp.asarray(jnp.finfo(state.dtype).eps, state.dtype) / self.law.equilibrium_distance.astype(state.dtype)
+        return (
+            state.position.largest()
+            * jnp.asarray(jnp.finfo(state.dtype).eps, state.dtype)
+            / self.law.equilibrium_distance.astype(state.dtype)
+        )
 
     def begin(self, state: State) -> State:
         """The state with the list that its pairs reuse: its own where it serves, else a new one."""

@@ -29,7 +29,8 @@ from ..topology.periods import box_of
 from ..vector import Vector
 from .base import Finding, Force, any_refused
 from .in_box import along_axes, check_rest_length, long_springs, turned_springs
-from .laws import Hooke, Law, PowerLaw, TensionOnly, has_no_direction, is_beyond_range, length_of, spring_block, spring_energy, spring_pull
+from .laws import Hooke, Law, PowerLaw, TensionOnly, has_no_direction, length_of, spring_block, spring_energy, spring_pull
+from .lengths import beyond_range
 from .linearisation import Linearisation
 from .living import counted, heeding, living, map_living
 
@@ -219,12 +220,10 @@ class Springs(Force):
                 needs_direction = needs_direction | (jnp.max(jnp.abs(jnp.stack(tuple(d))), axis=0) > 0)
             return (has_no_direction(d) & needs_direction).astype(jnp.int32)
 
-        def beyond(d: Vector, _: Array, l: Array) -> Array:
-            return is_beyond_range(d).astype(jnp.int32)
-
-        nowhere = jnp.asarray(-1, jnp.int32)
-        counts = (self.net.sum(self._each(state, of_family)) for of_family in (coincident, beyond))
-        return (*in_box, *(Finding(flag, n, nowhere) for flag, n in zip((Flag.COINCIDENT, Flag.NONFINITE), counts, strict=True)))
+        d, k, l = self._along(state)
+        near = self.net.sum(map_living(self.net, state, coincident, d, k, l))
+        at_one_place = Finding(Flag.COINCIDENT, near, jnp.asarray(-1, jnp.int32))
+        return (*in_box, at_one_place, beyond_range(self.net, state, self._seen(state), d))
 
     def diagnose_since(self, start: State, state: State) -> tuple[Finding, ...]:
         """BOX: springs that pull to another image than at the start."""
@@ -258,8 +257,7 @@ class Springs(Force):
         finest = jnp.min(jnp.where(rest > 0, jnp.minimum(jnp.where(length > 0, length, never), rest), never))
         longest = jnp.max(jnp.where(rest > 0, jnp.zeros_like(length), length))
         length = jnp.where(longest > 0, jnp.minimum(finest, longest), finest)
-        largest = jnp.max(jnp.stack([jnp.max(jnp.abs(a)) for a in self._seen(state)]))
-        return largest * jnp.asarray(jnp.finfo(state.dtype).eps, state.dtype) / length
+        return self._seen(state).largest() * jnp.asarray(jnp.finfo(state.dtype).eps, state.dtype) / length
 
     def natural_length(self, state: State) -> Array | EdgeField:
         """Rest length of each spring in this state [m]: the state's own where it has one, else the given one, times the expansion."""

@@ -234,7 +234,7 @@ class _Search(eqx.Module):
         # Each effect by itself, so that a balance of large forces is not taken for their absence.
         sizes = (norm(scene.system.hold(f.force(state))) for f in scene.system.forces)
         # Positions are rounded, and stiff springs feel it.
-        rounding = 8 * float(jnp.finfo(u.dtype).eps) * stiffness * _largest(state.position)
+        rounding = 8 * float(jnp.finfo(u.dtype).eps) * stiffness * state.position.largest()
         goal = self.tolerance_for(u.dtype) * sum(sizes, start=jnp.zeros((), u.dtype)) + rounding
         merit = norm(force) if energy is None else energy
         return _Progress(u, force, merit, goal, at.radius, at.passes + 1, at.iterations + found.iterations, at.curvature, at.is_drifting)
@@ -342,7 +342,7 @@ def _drifts(at: _Progress, along: Vector, product: Callable[[Vector], Vector], s
 
 def _ran_away(scene: _Scene, at: _Progress) -> Array:
     """Whether the net has left: nothing holds it."""
-    far, size = _largest(at.u), _size(scene)
+    far, size = at.u.largest(), _size(scene)
     return (far > _RUNAWAY * size) | (at.is_drifting & (far > size))
 
 
@@ -351,11 +351,6 @@ def _size(scene: _Scene) -> Array:
     extents = jnp.stack([jnp.max(a) - jnp.min(a) for a in scene.start.position])
     largest = jnp.max(extents)
     return jnp.where(largest > 0, largest, jnp.ones_like(largest))
-
-
-def _largest(v: Vector) -> Array:
-    """Largest magnitude of any coordinate."""
-    return jnp.max(jnp.stack([jnp.max(jnp.abs(a)) for a in v]))
 
 
 __all__ = ["Equilibrium", "equilibrium"]

@@ -87,7 +87,7 @@ class Stage(eqx.Module):
     def rounding(self) -> Array:
         """What rounding of the positions makes of the forces [N]: a net at rest has no other force to compare with."""
         at = self.predictor
-        largest = jnp.max(jnp.stack([jnp.max(jnp.abs(a)) for a in at.position]))
+        largest = at.position.largest()
         bounds = [bound for bound in (force.stiffness_bound(at) for force in self.system.forces) if bound is not None]
         stiffness = self.system.hold(at.position.map(lambda a: sum(bounds, start=jnp.zeros_like(a))))
         return 8 * float(jnp.finfo(largest.dtype).eps) * largest * norm(stiffness)

@@ -52,7 +52,7 @@ def test_c1_just_above_the_limit(rng, stepper):
     assert result.status.has(Flag.NONFINITE)
     step = int(result.status.step)
     # The growth per step at w dt = 2.02 is acosh(2 * 1.01^2 - 1) = 0.2826 for both steppers. It fails where the square of a length
-    # leaves float64; before that it folds, for a time that hangs on the last bit: over 96 starts and two compilers 0.16 to 0.50 of the rest.
+    # leaves float64; before that it folds, for a time that hangs on the last bit: 0.16 to 0.50 of the rest over 96 runs.
     assert np.log(1e154) / 0.2826 < step < np.log(1e154) / 0.2826 * 1.8
     with pytest.raises(js.SimulationError, match=rf"step {step}.*stability limit of this run was dt = 0\.01\."):
         js.raise_for_status(result)

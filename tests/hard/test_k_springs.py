@@ -468,7 +468,9 @@ def instances():
     direct = js.Skyline(TWO)
     resume = js.Resume(number, whole, whole, number, number, None, whole, whole, Origin.of(system, state, js.SymplecticEuler()))
     ode = js.OdeInfo(whole, whole, whole, None, None)
-    fit = js.Fit({"k": number}, {"k": number}, 1.0, 3, js.History(*np.ones((3, 2))), None, None, None, status, js.StopReason.ITERATIONS, None, "")
+    fit = js.Fit(
+        {"k": number}, {"k": number}, 1.0, 3, js.History(*np.ones((3, 2))), None, None, None, status, js.StopReason.ITERATIONS, None, ""
+    )
     pixels = js.PixelSprings(None, 1.0)
     classes = [
         js.Account(number, number, number, number, number, number),

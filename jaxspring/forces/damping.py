@@ -141,7 +141,7 @@ class Dashpots(Force):
 
         d = self.net.difference(state.position)
         blind = Finding(Flag.COINCIDENT, self.net.sum(map_living(self.net, state, near, d)), jnp.asarray(-1, jnp.int32))
-        far = beyond_range(self.net, state, state.position, d)
+        far = beyond_range(self.net, self.net, state, state.position)
         return (blind, far, *long_springs(self.net, state.position, living(self.net, state)))
 
     def diagnose_since(self, start: State, state: State) -> tuple[Finding, ...]:

@@ -220,10 +220,8 @@ class Springs(Force):
                 needs_direction = needs_direction | (jnp.max(jnp.abs(jnp.stack(tuple(d))), axis=0) > 0)
             return (has_no_direction(d) & needs_direction).astype(jnp.int32)
 
-        d, k, l = self._along(state)
-        near = self.net.sum(map_living(self.net, state, coincident, d, k, l))
-        at_one_place = Finding(Flag.COINCIDENT, near, jnp.asarray(-1, jnp.int32))
-        return (*in_box, at_one_place, beyond_range(self.net, state, self._seen(state), d))
+        at_one_place = Finding(Flag.COINCIDENT, self.net.sum(self._each(state, coincident)), jnp.asarray(-1, jnp.int32))
+        return (*in_box, at_one_place, beyond_range(self.net, self._near(), state, self._seen(state)))
 
     def diagnose_since(self, start: State, state: State) -> tuple[Finding, ...]:
         """BOX: springs that pull to another image than at the start."""

@@ -87,19 +87,20 @@ class Precision(eqx.Module):
         """At the start of a run."""
         return stopped(Precision(tuple(force.rounding(state) for force in ready.forces), state.position.largest()))
 
-    def look(self, ready: System, carry: Carry) -> Status:
-        """PRECISION where coordinates have grown too large for a force.
+    def look(self, ready: System, carry: Carry, status: Status) -> Status:
+        """The status, with PRECISION where coordinates have grown too large for a force.
 
-        Springs are measured only where the coordinates come within a tenth of what the lengths at the start allow.
+        Springs are measured only where the coordinates have grown, and come within a tenth of what the lengths at the start allow; no more
+        once it has been told.
         """
         ready, carry = stopped((ready, carry))
         grown = carry.state.position.largest() / self.size
-        status = Status.ok()
+        # NaN, where all coordinates were zero, counts as grown.
+        is_open = ~status.has(Flag.PRECISION) & ~(grown <= 1.125)
         for i, error in enumerate(self.errors):
             if error is None:
                 continue
-            # NaN, where all coordinates were zero, counts as near.
-            is_near = any_lane(~(error * grown <= SPOILT / 10))
+            is_near = any_lane(is_open & ~(error * grown <= SPOILT / 10))
             force, nothing = ready.forces[i], jnp.zeros_like(error)
             now = lax.cond(is_near, lambda state, force=force: force.rounding(state), lambda _, none=nothing: none, carry.state)
             status = status.then(Status.when(Flag.PRECISION, now > SPOILT, step=carry.step, effect=i))
@@ -137,7 +138,7 @@ def begin(system: System, ready: System, precise: Precision, carry: Carry, dt: A
 
 def inspect(system: System, precise: Precision, start: State, after: Carry, status: Status) -> Status:
     """The status brought up to date at the end of a block of a run from `start`."""
-    return status.then(look(system, after, start)).then(precise.look(system, after))
+    return precise.look(system, after, status.then(look(system, after, start)))
 
 
 def look(system: System, carry: Carry, start: State | None = None) -> Status:

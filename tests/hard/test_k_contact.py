@@ -67,7 +67,7 @@ def test_l1_a_bounce_in_closed_form(stepper):
     values, slopes = jax.jit(jax.vmap(jax.value_and_grad(lambda p: height(p, stepper, 75))))(inputs)
     for name, p, value, slope in zip(CASES, inputs, values, slopes, strict=True):
         np.testing.assert_allclose(value, exact(*p).real, atol=1e-9, err_msg=name)
-        np.testing.assert_allclose(slope, exact_derivatives(p), atol=1e-8, rtol=1e-9, err_msg=name)
+        np.testing.assert_allclose(slope, exact_derivatives(p), atol=1e-9, rtol=1e-9, err_msg=name)
 
 
 @pytest.mark.slow

@@ -16,12 +16,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax
 import numpy as np
 
 import jaxspring as js
+from jaxspring.scenes.melting.scene import MeltSettings, melting_block
 
 PAGE = Path(__file__).parent.parent / "docs" / "transforms.md"
 Function = Callable[[jax.Array], jax.Array]
@@ -72,6 +74,45 @@ def heat(scheme: js.HeatScheme) -> Function:
     return end
 
 
+def bounce(p: jax.Array) -> jax.Array:
+    """Scales of restitution and weight -> where two balls are after they have met the floor, the second within a step."""
+    net = js.lattice(2)
+    start = js.State.from_points(net, np.array([[0.0, 0.3], [1.0, 0.05]]), np.array([[1.0, 0.0], [0.0, -1.0]]))
+    weight = js.Gravity(jnp.stack([jnp.zeros(()), -9.81 * p[1]]))
+    system = js.System(net, 1.0, weight, rules=js.Floor((0.0, 0.0), (0.0, 1.0), restitution=0.6 * p[0], friction=0.1))
+    return js.rollout(system, start, js.VelocityVerlet(), 0.15, 2).state.points.ravel()
+
+
+def fluid(pairs: js.Pairs) -> Function:
+    """Scales of depth and diameter -> where four particles of a Lennard-Jones fluid with pair drag are after two steps."""
+    net = js.Graph.from_edges(np.zeros((0, 2), int), 4)
+    points = np.array([[0.0, 0.0], [1.2, 0.1], [0.3, 1.1], [1.5, 1.4]])
+
+    def end(p: jax.Array) -> jax.Array:
+        law = js.LennardJones(p[0], p[1])
+        force = js.Fluid(law, cutoff=js.ShiftedForce(2.5), pairs=pairs, drag=js.PairDrag(0.5, 2.0))
+        start = js.State.from_points(net, points, 0.3 * points[::-1])
+        return js.rollout(js.System(net, 1.0, force), start, js.VelocityVerlet(), 0.05, 2).state.points.ravel()
+
+    return end
+
+
+def melting(p: jax.Array) -> jax.Array:
+    """Scales of stiffness and conductivity -> velocities and temperatures of the melting block after two steps, its lowest layer molten."""
+    with jax.ensure_compile_time_eval():
+        scene = melting_block(MeltSettings(nodes=(2, 2, 3)))
+        points = np.asarray(scene.state.points) * [1.1, 1.0, 1.05] + [0.0, 0.0, 1e-3]
+
+    def constants(system: Any) -> tuple[Any, Any]:
+        return system.forces[0].stiffness.full, system.rules[0].rules[0].conductance
+
+    full, conductance = constants(scene.system)
+    system = eqx.tree_at(constants, scene.system, (p[0] * full, p[1] * conductance))
+    start = js.State.from_points(scene.net, points, temperature=np.repeat([360.0, 340.0, 310.0], 4))
+    state = js.rollout(system, start, js.SymplecticEuler(), 4e-4, 2).state
+    return jnp.concatenate([state.velocities.ravel(), jnp.ravel(state.temperature) / 300])
+
+
 STEPPERS: dict[str, Function] = {
     "ForwardEuler": chain(js.ForwardEuler()),
     "SymplecticEuler": chain(js.SymplecticEuler()),
@@ -94,6 +135,12 @@ OTHERS: dict[str, Function] = {
     "CrankNicolsonHeat": heat(js.CrankNicolsonHeat(js.JaxCG(tolerance=1e-13))),
     "SplitHeat": heat(js.SplitHeat()),
     "SymmetricSplitHeat": heat(js.SymmetricSplitHeat()),
+}
+SCENES: dict[str, Function] = {
+    "a bounce with friction": bounce,
+    "fluid, all pairs": fluid(js.AllPairs()),
+    "fluid, neighbour list": fluid(js.NeighbourList(capacity=3, skin=0.3)),
+    "melting block": melting,
 }
 
 
@@ -170,7 +217,7 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)
     # Programs run once: compiling is all that takes time.
     jax.config.update("jax_disable_most_optimizations", True)
-    section = f"## jax {jax.__version__}\n\n{table('stepper', STEPPERS)}\n\n{table('solver, scheme', OTHERS)}\n"
+    section = f"## jax {jax.__version__}\n\n{table('stepper', STEPPERS)}\n\n{table('solver, scheme', OTHERS)}\n\n{table('scene', SCENES)}\n"
     head, *others = re.split(r"^(?=## jax )", PAGE.read_text(), flags=re.MULTILINE)
     kept = [other.strip() + "\n" for other in others if not other.startswith(f"## jax {jax.__version__}\n")]
     PAGE.write_text("\n".join([head.strip() + "\n", *sorted([*kept, section])]))

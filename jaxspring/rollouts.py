@@ -29,7 +29,7 @@ from .numerics import is_traced, stopped
 from .progress import LONG_RUN, N_CHUNKS, Progress
 from .resume import Origin, Resume, check_kind, checksum, taken_up
 from .state import State
-from .status import EXPLANATION, Flag, StabilityWarning, Status
+from .status import EXPLANATION, WARNINGS, Flag, StabilityWarning, Status
 from .steppers.base import Stepper
 from .steppers.stability import dt_limit
 from .system import System
@@ -53,7 +53,9 @@ class Info(eqx.Module):
 
 
 class _Job(eqx.Module):
-    """How a run is done: the arguments of `rollout` besides where it starts."""
+    """How a run is done: the arguments of `rollout` besides where it starts, and whether a failed run is replayed by the same program
+    (static). An eager run leaves that out, which saves a fifth of the compile, and is done again with it where it failed.
+    """
 
     stepper: Stepper
     dt: Array
@@ -61,6 +63,7 @@ class _Job(eqx.Module):
     plan: Plan = eqx.field(static=True)
     keep_solves: bool = eqx.field(static=True)
     functions: str = eqx.field(static=True)
+    replays: bool = eqx.field(static=True, default=True)
 
     def keep(self, carry: Carry) -> tuple[Any, SolveInfo | None]:
         """What a frame holds."""
@@ -150,7 +153,8 @@ def rollout(
 
 def _warn(result: Result, dt: Array) -> None:
     """Warn of a dt and a dtype that may be at fault, at the line that called `rollout`."""
-    if result.info.stable_dt is not None and bool(result.status.has(Flag.DT_LIMIT)):
+    raised = Flag(int(result.status.flags))
+    if result.info.stable_dt is not None and Flag.DT_LIMIT in raised:
         limit = float(result.info.stable_dt)
         if abs(float(dt)) > limit:
             text = f"{EXPLANATION[Flag.DT_LIMIT]}: dt = {float(dt):.6g} s, but this run is surely stable only up to {limit:.6g} s"
@@ -162,7 +166,7 @@ def _warn(result: Result, dt: Array) -> None:
             )
         warnings.warn(f"DT_LIMIT: {text}.", StabilityWarning, stacklevel=3)
     # A run that failed has grown too large as well, but that is not what was wrong.
-    if bool(result.status.has(Flag.PRECISION)) and bool(result.status.is_ok):
+    if Flag.PRECISION in raised and raised in WARNINGS:
         warnings.warn(f"PRECISION: {EXPLANATION[Flag.PRECISION]}.", StabilityWarning, stacklevel=3)
 
 
@@ -234,10 +238,10 @@ def _proceed(begun: _Begun, job: _Job, progress: Progress | None = None) -> Resu
     advance, look = partial(_advance, ready, job.stepper, clock), partial(inspect, ready, begun.precise, begun.state)
     (carry, status), frames = run_blocks(advance, look, job.keep, report, (carry, begun.status), job.plan)
     saved, solves_saved = (None, None) if frames is None else frames
-    if carry.solves is None:
+    if carry.solves is None and job.replays:
         # The replay of a failed run is not part of what is differentiated.
         status = settle(partial(_advance, still, job.stepper, stopped(clock)), first, status, still)
-    else:
+    elif carry.solves is not None:
         # An implicit step looks at itself, so that nothing need be replayed. What was wrong before the first step comes first.
         at_start = status.step == resume.step
         status = status.only_if(at_start).then(carry.solves.status).then(status.only_if(~at_start))
@@ -306,19 +310,23 @@ _compiled_proceed = eqx.filter_jit(_proceed)
 
 def _run_eagerly(system: System, state: State, resume: Resume | None, job: _Job, progress: Progress | None) -> Result:
     """The run in chunks, with the host between them where somebody watches or the run is long."""
-    plan = job.plan
+    plan, job = job.plan, replace(job, replays=False)
     # A piece costs some passes over the state: without a watcher each is long enough for that not to show.
     n_pieces = N_CHUNKS if progress is not None else min(N_CHUNKS, plan.n_steps * math.prod(state.position.shape) // LONG_RUN)
     pieces = plan.pieces(n_pieces)
     if len(pieces) == 1 and progress is None:
-        return _compiled(system, state, resume, job)
+        result = _compiled(system, state, resume, job)
+        return _compiled(system, state, resume, replace(job, replays=True)) if _is_unnamed(result) else result
     begun = _compiled_begin(system, state, resume, job)
     # One name, so that Ctrl-C at any moment finds the result and its frames together.
     so_far: tuple[Any, tuple[Any, ...], int] = (None, (), 0)
     try:
         for piece in pieces:
             before, frames, done = so_far
-            latest = _compiled_proceed(begun if before is None else begun.at(before), replace(job, plan=piece))
+            at, part = begun if before is None else begun.at(before), replace(job, plan=piece)
+            latest = _compiled_proceed(at, part)
+            if _is_unnamed(latest) and (before is None or not before.status.has(Flag.NONFINITE)):
+                latest = _compiled_proceed(at, replace(part, replays=True))
             if len(pieces) > 1 or progress is not None:
                 jax.block_until_ready(latest)
             frame = (latest.saved, latest.info.solves_saved)
@@ -338,6 +346,11 @@ def _run_eagerly(system: System, state: State, resume: Resume | None, job: _Job,
         saved, solves_saved = jax.tree.map(lambda *parts: jnp.concatenate(parts), *frames)
         result = replace(result, saved=saved, info=replace(result.info, solves_saved=solves_saved))
     return result
+
+
+def _is_unnamed(result: Result) -> bool:
+    """Whether a run of explicit steps failed at a step that is not known yet."""
+    return result.info.solves is None and Flag.NONFINITE in Flag(int(result.status.flags))
 
 
 def _joined(first: Result, latest: Result) -> Info:

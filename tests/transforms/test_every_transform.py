@@ -35,3 +35,10 @@ def test_transforms_go_through_every_stepper(name):
 def test_forward_mode_goes_through_every_kind_of_solver(name):
     """The Jacobian, with batched tangents, agrees with differences."""
     assert cells(transforms.OTHERS[name], ["jacfwd"]) == {"jacfwd": "right"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", transforms.SCENES)
+def test_transforms_go_through_every_scene(name):
+    """Batched gradients agree with differences."""
+    assert cells(transforms.SCENES[name], ["vmap(grad)"]) == {"vmap(grad)": "right"}

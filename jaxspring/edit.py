@@ -8,6 +8,7 @@ from typing import Any
 
 import equinox as eqx
 
+from ._arrays import Numbers, SpringNumbers
 from ._checks import is_concrete
 from .forces.adaptive import ImageStiffness
 from .forces.base import Force
@@ -17,18 +18,18 @@ from .system import System
 def replace(
     system: System,
     *,
-    stiffness: Any = None,
-    rest_length: Any = None,
-    gamma: Any = None,
-    damping: Any = None,
-    acceleration: Any = None,
-    strength: Any = None,
-    mass_rate: Any = None,
-    stiffness_time: Any = None,
-    k_min: Any = None,
-    k_max: Any = None,
-    sigma: Any = None,
-    mass: Any = None,
+    stiffness: SpringNumbers | None = None,
+    rest_length: SpringNumbers | None = None,
+    gamma: Numbers | None = None,
+    damping: SpringNumbers | None = None,
+    acceleration: Numbers | None = None,
+    strength: Numbers | None = None,
+    mass_rate: Numbers | None = None,
+    stiffness_time: Numbers | None = None,
+    k_min: Numbers | None = None,
+    k_max: Numbers | None = None,
+    sigma: Numbers | None = None,
+    mass: Numbers | None = None,
     effect: int | None = None,
 ) -> System:
     """The system with some constants replaced; everything else is shared with the old one.

@@ -65,7 +65,7 @@ def load(path: Path, like: PyTree = None) -> PyTree:
     return restored(path, archive.arrays, like)
 
 
-def save_trajectory(path: Path, states: Any, net: Topology | None = None) -> None:
+def save_trajectory(path: Path, states: State, net: Topology | None = None) -> None:
     """Save frames as an `.npz` that `numpy.load` opens: `time` (F,) [s], `points` and `velocities` (F, N, D) [m, m/s].
 
     Args:

@@ -8,17 +8,16 @@ Source: row sums of the consistent mass matrix of linear elements (lumping).
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ._arrays import Numbers
 from ._checks import as_inexact, finite, has_shape, positive, triangle_indices
 from .topology.base import Topology, about_middle
 from .topology.periods import box_of, check_dim, nearest_image
 
 
-def lumped_mass(net: Topology, points: Any, density: Any, triangles: Any = None) -> Array:
+def lumped_mass(net: Topology, points: Numbers, density: Numbers, triangles: Numbers | None = None) -> Array:
     """(N,) node masses [kg] from a density, in the user's order.
 
     Along springs (density [kg/m]) each spring gives half its mass to either end. With triangles (density [kg/m^2]) each triangle gives

@@ -23,7 +23,7 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array
 
-from ._arrays import given
+from ._arrays import Numbers, given
 from ._checks import as_inexact, finite, has_shape, is_concrete, shape_of
 from .forces.linearisation import ExactTangent
 from .linalg.eigen import lowest_eigenpairs, symmetric_eigen
@@ -100,7 +100,7 @@ def normal_modes(system: System, state: State, n_modes: int | None = None) -> Mo
     return modes
 
 
-def frequency_response(system: System, state: State, frequencies: Any, force: Any) -> Array:
+def frequency_response(system: System, state: State, frequencies: Numbers, force: Numbers) -> Array:
     """Complex amplitudes of the steady motion under a harmonic load, damping included.
 
     A dense solve for each frequency: up to 2,048 unknowns (N D). Differentiable in everything. Without damping the amplitude at a

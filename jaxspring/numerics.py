@@ -98,10 +98,11 @@ def _outcome(function: _Flat | _Lanes, args: Sequence[Any]) -> tuple[Any, list[S
         hash(function)
     except TypeError:
         return _outcome_anew(function, like)
-    return _outcome_once(function, like, bool(jax.config.jax_enable_x64))
+    return _outcome_once(function, like, str(jax.dtypes.canonicalize_dtype("float64")))
 
 
-def _outcome_anew(function: _Flat | _Lanes, like: tuple[Any, ...], is_x64: bool | None = None) -> tuple[Any, list[ShapedArray]]:
+def _outcome_anew(function: _Flat | _Lanes, like: tuple[Any, ...], widest: str | None = None) -> tuple[Any, list[ShapedArray]]:
+    """The same by tracing; `widest` is the largest floating type that JAX allows, by which cached results are told apart."""
     out = jax.eval_shape(function.tree, *(jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in like))
     leaves, tree = tree_util.tree_flatten(out)
     return tree, [ShapedArray(leaf.shape, leaf.dtype) for leaf in leaves]

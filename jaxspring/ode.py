@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ._arrays import given
+from ._arrays import Numbers, given
 from ._checks import as_inexact, finite, has_shape, is_concrete
 from .events import on_states
 from .forces.fluid import Fluid
@@ -75,7 +75,7 @@ class OdeResult(eqx.Module):
     event: Any
     effects: tuple[str, ...] = eqx.field(static=True)
 
-    def at(self, time: Any) -> State:
+    def at(self, time: Numbers) -> State:
         """The state at any time [s] between the start and the end; needs `saveat=diffrax.SaveAt(dense=True)`."""
         if self.info.interpolation is None:
             raise ValueError("this result keeps no interpolation. Pass saveat=diffrax.SaveAt(dense=True) to diffeqsolve.")
@@ -93,9 +93,9 @@ class OdeResult(eqx.Module):
 def diffeqsolve(
     system: System,
     state: State,
-    t1: Any,
+    t1: Numbers,
     solver: diffrax.AbstractSolver | None = None,
-    dt0: Any = None,
+    dt0: Numbers | None = None,
     saveat: diffrax.SaveAt | None = None,
     stepsize_controller: diffrax.AbstractStepSizeController | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import pathlib
 import tempfile
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
 
+from ._arrays import Numbers
 from ._checks import has_shape
 from .archive import atomic_file
 from .state import State
@@ -16,13 +17,17 @@ from .system import System
 from .topology.base import Topology
 from .topology.edge_field import EdgeField
 
+if TYPE_CHECKING:
+    from .ode import OdeResult
+    from .rollouts import Result
+
 COORDINATES = "xyz"
 
 
 def plot(
     net: Topology,
     state: State,
-    color: Any = None,
+    color: Numbers | EdgeField | None = None,
     color_label: str = "tension (N)",
     length_unit: str = "m",
     axes: Any = None,
@@ -80,7 +85,7 @@ def plot(
 
 
 def animate(
-    result: Any,
+    result: Result | OdeResult,
     net: Topology,
     path: str | pathlib.Path,
     frames_per_second: float = 20.0,

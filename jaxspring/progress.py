@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
-from typing import Any, TextIO
+from typing import SupportsInt, TextIO
 
 import equinox as eqx
 
@@ -32,7 +32,7 @@ class Progress(eqx.Module):
     stream: TextIO | None = eqx.field(static=True, default=None)
     bar: bool = eqx.field(static=True, default=True)
 
-    def update(self, done: Any, total: int) -> None:
+    def update(self, done: SupportsInt, total: int) -> None:
         """Draw the bar and call the callback; for the host."""
         done = int(done)
         if self.bar:

@@ -21,6 +21,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
+from ._arrays import Numbers
 from ._checks import as_inexact, finite, has_shape, is_concrete
 from .blocks import Adjoint, Checkpointed, Plan, make_plan, run_blocks
 from .facts import digest, facts
@@ -95,7 +96,7 @@ def rollout(
     system: System,
     state: State,
     stepper: Stepper,
-    dt: Any,
+    dt: Numbers,
     n_steps: int,
     save_every: int | None = None,
     observe: Callable[[State], Any] | None = None,

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.typing import ArrayLike
 from jaxtyping import Array, Int, UInt32
 
 
@@ -100,7 +101,15 @@ class Status(eqx.Module):
         return Status(jnp.zeros((), jnp.uint32), nowhere, nowhere, nowhere, jnp.zeros((), jnp.int32))
 
     @staticmethod
-    def when(flag: Flag, condition: Any, *, step: Any = NOWHERE, node: Any = NOWHERE, effect: int = NOWHERE, count: Any = 1) -> Status:
+    def when(
+        flag: Flag,
+        condition: ArrayLike,
+        *,
+        step: ArrayLike = NOWHERE,
+        node: ArrayLike = NOWHERE,
+        effect: int = NOWHERE,
+        count: ArrayLike = 1,
+    ) -> Status:
         """A status with `flag` where `condition` holds, and OK where it does not."""
         raised = jnp.asarray(condition, jnp.bool_)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ._arrays import as_mask, kept
+from ._arrays import Numbers, as_mask, kept
 from ._checks import as_inexact, has_shape, positive, shape_of
 from .forces.base import Force, Rule, Step
 from .forces.contact import strike
@@ -86,7 +86,15 @@ class System(eqx.Module):
     motion: Motion | None
     rules: tuple[Rule, ...] | None
 
-    def __init__(self, net: Topology, mass: Any, forces: Any = (), free: Any = None, motion: Motion | None = None, rules: Any = ()):
+    def __init__(
+        self,
+        net: Topology,
+        mass: Numbers,
+        forces: Force | Sequence[Force] = (),
+        free: Numbers | None = None,
+        motion: Motion | None = None,
+        rules: Rule | Sequence[Rule] = (),
+    ):
         """Args:
             net: the topology.
             mass: [kg]: a number, or (N,) in the user's order.

@@ -21,7 +21,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array
 
-from .._arrays import given
+from .._arrays import Numbers, given
 from .._checks import as_inexact, has_shape, is_concrete, nonnegative
 from ..images.image import Image
 from ..images.observation import GradientMagnitude, adaptation
@@ -67,9 +67,9 @@ class ImageStiffness(StiffnessRule):
     def __init__(
         self,
         image: Image,
-        k_min: Any,
-        k_max: Any,
-        sigma: Any,
+        k_min: Numbers,
+        k_max: Numbers,
+        sigma: Numbers,
         observation: Callable[[Image], Array] | None = None,
         sampling: Any = None,
         radius: int | None = None,

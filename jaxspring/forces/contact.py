@@ -16,6 +16,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from .._arrays import Numbers
 from .._checks import as_inexact, has_shape, is_concrete, nonnegative, plane
 from ..numerics import any_lane
 from ..state import State
@@ -54,7 +55,7 @@ class Floor(Rule):
     friction: Array
     restitution: Array
 
-    def __init__(self, point: Any, normal: Any, friction: Any = 0.0, restitution: Any = 0.0):
+    def __init__(self, point: Numbers, normal: Numbers, friction: Numbers = 0.0, restitution: Numbers = 0.0):
         self.point, self.normal = plane(point, normal)
         self.friction, self.restitution = as_inexact("friction", friction), as_inexact("restitution", restitution)
         for name, value in (("friction", self.friction), ("restitution", self.restitution)):

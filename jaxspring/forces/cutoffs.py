@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .._arrays import Numbers
 from .._checks import constant, is_concrete
 from .base import any_not_positive
 from .pair_laws import PairLaw
@@ -133,7 +134,7 @@ class Switched(Cutoff):
     on: Array
     off: Array
 
-    def __init__(self, on: Any, off: Any):
+    def __init__(self, on: Numbers, off: Numbers):
         self.on, self.off = constant("on", on, NOTHING_LEFT), constant("off", off, NOTHING_LEFT)
         if is_concrete(self.on) and is_concrete(self.off) and not np.asarray(self.on) < np.asarray(self.off):
             raise ValueError(f"on = {self.on} is not below off = {self.off}: the force would be switched off before it begins to fade.")

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from .._arrays import Numbers, SpringNumbers
 from .._checks import node_values, nonnegative
 from ..linalg.operators import Blocks, SpringBlocks, isotropic
 from ..numerics import cast_inexact, tiny
@@ -43,7 +44,7 @@ class Drag(Force):
 
     gamma: Array
 
-    def __init__(self, gamma: Any):
+    def __init__(self, gamma: Numbers):
         self.gamma = node_values("gamma", gamma)
         nonnegative("gamma", self.gamma, "A negative drag feeds energy in.")
 
@@ -96,7 +97,7 @@ class Dashpots(Force):
     net: Topology
     damping: Any
 
-    def __init__(self, net: Topology, damping: Any):
+    def __init__(self, net: Topology, damping: SpringNumbers):
         self.net = net
         self.damping = _edge_constant(net, "damping", damping)
         _check_sign("damping", self.damping, "A negative damper feeds energy in.")

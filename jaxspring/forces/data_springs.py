@@ -16,9 +16,10 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from .._arrays import Numbers
 from .._checks import as_inexact, finite, has_shape, node_values, nonnegative
 from ..images.image import Image
-from ..images.sampling import Bilinear
+from ..images.sampling import Bilinear, Sampling
 from ..images.surface import Surface
 from ..linalg.operators import Blocks, NodeDyads
 from ..numerics import cast_inexact
@@ -44,7 +45,7 @@ class DataSprings(Force):
     sampling: Any
     conservative: bool = eqx.field(static=True)
 
-    def __init__(self, image: Image, stiffness: Any, sampling: Any = None, conservative: bool = False):
+    def __init__(self, image: Image, stiffness: Numbers, sampling: Sampling | None = None, conservative: bool = False):
         self.image = image
         self.stiffness = node_values("stiffness", stiffness)
         self.sampling = Bilinear() if sampling is None else sampling
@@ -121,7 +122,7 @@ class ImageAttraction(Force):
     strength: Array
     sampling: Any
 
-    def __init__(self, image: Image, strength: Any, sampling: Any = None):
+    def __init__(self, image: Image, strength: Numbers, sampling: Sampling | None = None):
         self.image = image
         self.strength = as_inexact("strength", strength)
         has_shape("strength", self.strength, {"one number": ()})

@@ -20,6 +20,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from .._arrays import Numbers
 from .._checks import constant, is_concrete, kind
 from ..numerics import any_lane, stopped
 from ..state import State
@@ -79,7 +80,7 @@ class Fluid(Force):
         cutoff: Cutoff | None = None,
         pairs: Pairs | None = None,
         drag: PairDrag | None = None,
-        core: Any = None,
+        core: Numbers | None = None,
         molten: Molten | None = None,
     ):
         self.law = kind("law", law, PairLaw, "SlideLaw(alpha=1.0, beta=1.0)")

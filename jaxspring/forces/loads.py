@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from .._arrays import Numbers
 from .._checks import as_inexact, finite, fits_nodes, node_values, shape_of
 from ..state import State
 from ..topology.base import Topology
@@ -26,7 +26,7 @@ class Gravity(Force):
     acceleration: Array
     mass: Array | None
 
-    def __init__(self, acceleration: Any, mass: Any = None):
+    def __init__(self, acceleration: Numbers, mass: Numbers | None = None):
         self.acceleration = as_inexact("acceleration", acceleration)
         finite("acceleration", self.acceleration)
         if self.acceleration.ndim != 1 or self.acceleration.shape[0] not in (1, 2, 3):
@@ -89,7 +89,7 @@ class Load(Force):
         self.value = value
 
     @staticmethod
-    def from_points(net: Topology, forces: Any) -> Load:
+    def from_points(net: Topology, forces: Numbers) -> Load:
         """A constant load from an (N, D) array [N] in the user's node order."""
         return Load(net.vector_field(forces, "forces"))
 

@@ -13,8 +13,6 @@ enters or leaves it has no force there.
 
 from __future__ import annotations
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -22,6 +20,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from .._arrays import Numbers
 from .._checks import constant
 from ..numerics import any_lane
 from ..status import Flag, Status
@@ -82,7 +81,7 @@ class NeighbourList(Pairs):
     capacity: int = eqx.field(static=True)
     skin: Array
 
-    def __init__(self, capacity: int, skin: Any):
+    def __init__(self, capacity: int, skin: Numbers):
         if not isinstance(capacity, (int, np.integer)) or isinstance(capacity, bool) or capacity < 1:
             raise ValueError(f"capacity = {capacity!r}; expected a whole number of neighbours, 1 or more.")
         self.capacity = -(-int(capacity) // SLOTS) * SLOTS

@@ -9,12 +9,11 @@ Source: the dissipative force of dissipative particle dynamics; the slides' flui
 
 from __future__ import annotations
 
-from typing import Any
-
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from .._arrays import Numbers
 from .._checks import constant
 from .base import any_not_positive, any_refused
 
@@ -30,7 +29,7 @@ class PairDrag(eqx.Module):
     damping: Array
     radius: Array
 
-    def __init__(self, damping: Any, radius: Any):
+    def __init__(self, damping: Numbers, radius: Numbers):
         self.damping = constant("damping", damping, "A negative drag feeds energy in.", may_be_zero=True)
         self.radius = constant("radius", radius, "No pair would be within it: pass drag=None for no drag.")
 

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from .._arrays import Numbers
 from .._checks import constant
 from .base import any_not_positive, any_refused
 
@@ -138,7 +139,7 @@ class SlideLaw(_PowerPair):
     1.0916
     """
 
-    def __init__(self, alpha: Any, beta: Any, zeta: Any = 0.0, a: int = 2, b: int = 4):
+    def __init__(self, alpha: Numbers, beta: Numbers, zeta: Numbers = 0.0, a: int = 2, b: int = 4):
         super().__init__(alpha, beta, zeta, a, b)
 
     def weight(self, squared: Array) -> Array:
@@ -169,7 +170,7 @@ class UnitVectorLaw(_PowerPair):
         b: exponent of the repulsion, above a (static).
     """
 
-    def __init__(self, alpha: Any, beta: Any, zeta: Any = 0.0, a: int = 2, b: int = 4):
+    def __init__(self, alpha: Numbers, beta: Numbers, zeta: Numbers = 0.0, a: int = 2, b: int = 4):
         super().__init__(alpha, beta, zeta, a, b)
 
     def weight(self, squared: Array) -> Array:
@@ -204,7 +205,7 @@ class LennardJones(PairLaw):
     epsilon: Array
     sigma: Array
 
-    def __init__(self, epsilon: Any, sigma: Any):
+    def __init__(self, epsilon: Numbers, sigma: Numbers):
         self.epsilon = constant("epsilon", epsilon, NO_REST)
         self.sigma = constant("sigma", sigma, NO_REST)
 
@@ -239,7 +240,7 @@ class LennardJones(PairLaw):
         return any_not_positive(self.epsilon, self.sigma)
 
 
-def gentle_fluid(spacing: Any, zeta: Any = 0.0, alpha: Any = 1.0) -> SlideLaw:
+def gentle_fluid(spacing: Numbers, zeta: Numbers = 0.0, alpha: Numbers = 1.0) -> SlideLaw:
     """The slides' law whose pairs rest at the lattice's spacing h, so that a spring that fuses leaves its two particles without a push.
 
     r_0 = h asks for beta = alpha h**4 / (h + zeta)**2.

@@ -15,11 +15,13 @@ Source: Rayleigh, The Theory of Sound (1877), section 81; the clamped tangent as
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
 from jaxtyping import Array
 
+from .._arrays import Numbers
 from .._checks import as_inexact, fits_nodes, node_values, nonnegative
 from ..linalg.operators import Blocks, isotropic
 from ..numerics import cast_inexact
@@ -53,14 +55,18 @@ class Rayleigh(Force):
     forces: tuple[Force, ...] | None
     mass: Array | None
 
-    def __init__(self, mass_rate: Any, stiffness_time: Any, forces: Any = None, mass: Any = None):
+    def __init__(
+        self, mass_rate: Numbers, stiffness_time: Numbers, forces: Force | Sequence[Force] | None = None, mass: Numbers | None = None
+    ):
         self.mass_rate = _coefficient("mass_rate", mass_rate)
         self.stiffness_time = _coefficient("stiffness_time", stiffness_time)
         self.forces = (forces,) if isinstance(forces, Force) else None if forces is None else tuple(forces)
         self.mass = None if mass is None else node_values("mass", mass)
 
     @staticmethod
-    def from_ratios(first: tuple[Any, Any], second: tuple[Any, Any], forces: Any = None) -> Rayleigh:
+    def from_ratios(
+        first: tuple[Numbers, Numbers], second: tuple[Numbers, Numbers], forces: Force | Sequence[Force] | None = None
+    ) -> Rayleigh:
         """The damping with given ratios at two frequencies; between them it is less, outside more.
 
         Args:
@@ -75,7 +81,7 @@ class Rayleigh(Force):
         span = w2 * w2 - w * w
         return Rayleigh(2 * w * w2 * (z * w2 - z2 * w) / span, 2 * (z2 * w2 - z * w) / span, forces)
 
-    def damping_ratio(self, frequency: Any) -> Array:
+    def damping_ratio(self, frequency: Numbers) -> Array:
         """Damping ratio zeta = a / (2 w) + b w / 2 at frequencies [rad/s]; 1 is critical."""
         w = as_inexact("frequency", frequency)
         return self.mass_rate.astype(w.dtype) / (2 * w) + 0.5 * self.stiffness_time.astype(w.dtype) * w

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._arrays import whole_number
+from .._arrays import SpringNumbers, whole_number
 from .._checks import finite, is_concrete, nonnegative, positive
 from ..linalg.operators import Blocks, SpringBlocks
 from ..numerics import cast_inexact, tiny
@@ -104,8 +104,8 @@ class Springs(Force):
     def __init__(
         self,
         net: Topology,
-        stiffness: Any,
-        rest_length: Any = 0.0,
+        stiffness: SpringNumbers | StiffnessRule,
+        rest_length: SpringNumbers = 0.0,
         law: Law | None = None,
         axes: tuple[int, ...] | None = None,
         allow_negative_stiffness: bool = False,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -23,9 +23,12 @@ from .determined import Undetermined, from_jacobian, from_zeros, slopes
 from .explain import Seen, explanation
 from .fingerprint import fingerprint
 from .iteration import Objective, Report, first_memory, iterate, prepare, refuse_invalid, warn_of_zero_gradients
-from .optimisers import as_optimiser
+from .optimisers import Optimiser, as_optimiser
 from .stopping import Stop, StopReason
 from .transforms import to_constrained, to_free, transform_per_leaf
+
+if TYPE_CHECKING:
+    import optax
 
 PyTree = Any
 
@@ -112,7 +115,7 @@ class Iteration:
 def fit(
     loss: Callable[..., Any],
     parameters: PyTree,
-    optimiser: Any = None,
+    optimiser: Optimiser | optax.GradientTransformation | None = None,
     n_iterations: int = 100,
     on_iteration: Callable[[Iteration], bool | None] | None = None,
     carried: PyTree = None,

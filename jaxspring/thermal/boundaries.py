@@ -12,7 +12,8 @@ Source: Carslaw and Jaeger, Conduction of Heat in Solids (1959), section 1.9.
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Self
+from collections.abc import Callable
+from typing import Any, ClassVar, Self, TypeAlias
 
 import equinox as eqx
 import jax
@@ -20,13 +21,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._arrays import as_mask, own
+from .._arrays import Numbers, as_mask, own
 from .._checks import as_inexact, finite, has_shape, is_concrete, nonnegative
 from ..forces.base import any_refused
 from ..state import State
 from ..topology.base import NodeLayout, Topology
 
-Given = Any  # an array, or a function of time [s] that gives one
+# Numbers, or a function of time [s] that gives them.
+Given: TypeAlias = "Numbers | Callable[[Array], Numbers]"
 
 # CODATA 2018, exact to the digits given [W/(m^2 K^4)].
 STEFAN_BOLTZMANN = 5.670374419e-8
@@ -109,7 +111,7 @@ class FixedTemperature(ThermalBoundary):
     temperature: Given
     layout: NodeLayout = eqx.field(static=True)
 
-    def __init__(self, net: Topology, nodes: Any, temperature: Any):
+    def __init__(self, net: Topology, nodes: Numbers, temperature: Given):
         """Check what is given, and bring it to the shape of the net.
 
         Args:
@@ -149,7 +151,7 @@ class HeatFlux(ThermalBoundary):
     area: Array
     layout: NodeLayout = eqx.field(static=True)
 
-    def __init__(self, net: Topology, nodes: Any, flux: Any, area: Any):
+    def __init__(self, net: Topology, nodes: Numbers, flux: Given, area: Numbers):
         """Check what is given, and bring it to the shape of the net.
 
         Args:
@@ -196,7 +198,7 @@ class Convection(ThermalBoundary):
     area: Array
     layout: NodeLayout = eqx.field(static=True)
 
-    def __init__(self, net: Topology, nodes: Any, coefficient: Any, ambient: Any, area: Any):
+    def __init__(self, net: Topology, nodes: Numbers, coefficient: Numbers, ambient: Given, area: Numbers):
         """Check what is given, and bring it to the shape of the net.
 
         Args:
@@ -248,7 +250,7 @@ class Radiation(ThermalBoundary):
     area: Array
     layout: NodeLayout = eqx.field(static=True)
 
-    def __init__(self, net: Topology, nodes: Any, emissivity: Any, ambient: Any, area: Any):
+    def __init__(self, net: Topology, nodes: Numbers, emissivity: Numbers, ambient: Given, area: Numbers):
         """Check what is given, and bring it to the shape of the net.
 
         Args:
@@ -315,7 +317,7 @@ def _mask(net: Topology, nodes: Any) -> Array:
     return net.node_field(nodes, "nodes")
 
 
-def _given(net: Topology, name: str, value: Any) -> Given:
+def _given(net: Topology, name: str, value: Any) -> Any:
     if callable(value):
         return value
     value = as_inexact(name, value)

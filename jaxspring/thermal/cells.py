@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .._arrays import Numbers
 from .._checks import as_inexact, constant, has_shape, positive
 from ..topology.base import Topology
 from ..topology.lattice import Lattice
@@ -32,7 +33,7 @@ class Cells(eqx.Module):
     def share(self, net: Lattice, axis: int) -> np.ndarray:
         """(n,) along an axis of the array: the share of a full spacing that each node has."""
 
-    def volumes(self, net: Topology, spacing: Any, section: Any = 1.0) -> Array:
+    def volumes(self, net: Topology, spacing: Numbers, section: Numbers = 1.0) -> Array:
         """(N,) volume of each node [m^3].
 
         Args:
@@ -79,7 +80,9 @@ class HalfCells(Cells):
         return share
 
 
-def capacities(net: Topology, density: Any, specific_heat: Any, spacing: Any, section: Any = 1.0, cells: Cells | None = None) -> Array:
+def capacities(
+    net: Topology, density: Numbers, specific_heat: Numbers, spacing: Numbers, section: Numbers = 1.0, cells: Cells | None = None
+) -> Array:
     """(N,) heat capacities [J/K] of the nodes of a lattice, C = density * specific heat * volume, in the user's order.
 
     Args:

@@ -23,6 +23,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
+from .._arrays import Numbers
 from .._checks import as_inexact, has_shape, nonnegative, positive
 from ..topology.base import Topology
 from ..topology.edge_field import EdgeField
@@ -52,7 +53,7 @@ def harmonic_mean(net: Topology, value: Any, name: str = "value") -> EdgeField:
     return net.map_springs(of_family, inverse, without)
 
 
-def link_conductances(net: Topology, conductivity: Any, area: Any, length: Any) -> EdgeField:
+def link_conductances(net: Topology, conductivity: Numbers, area: Numbers, length: Numbers) -> EdgeField:
     """Conductances [W/K] of any net, as an edge field: c A / h with the harmonic mean of the ends' conductivities.
 
     Args:
@@ -79,7 +80,7 @@ def link_conductances(net: Topology, conductivity: Any, area: Any, length: Any) 
     return net.map_springs(lambda c, a, h: c * (a / h).astype(c.dtype), mean, *fields)
 
 
-def conductances(net: Topology, conductivity: Any, spacing: Any, section: Any = 1.0, cells: Cells | None = None) -> EdgeField:
+def conductances(net: Topology, conductivity: Numbers, spacing: Numbers, section: Numbers = 1.0, cells: Cells | None = None) -> EdgeField:
     """Conductances [W/K] of a lattice's springs, as an edge field.
 
     With a scalar conductivity the structural springs conduct; all others get zero. With a tensor the diagonals of squares (SHEAR) conduct

@@ -12,12 +12,12 @@ Source: Terzopoulos, Platt and Fleischer (1989): a thermoelastic unit fuses abov
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from .._arrays import Numbers
 from .._checks import as_inexact, finite, has_shape, nonnegative, positive
 from ..forces.base import Force, Rule, Step
 from ..forces.molten import Molten, check_springs
@@ -41,7 +41,7 @@ class Refreezing(eqx.Module):
     hysteresis: Array
     reach: Array
 
-    def __init__(self, hysteresis: Any, reach: Any):
+    def __init__(self, hysteresis: Numbers, reach: Numbers):
         self.hysteresis, self.reach = as_inexact("hysteresis", hysteresis), as_inexact("reach", reach)
         for name, value in (("hysteresis", self.hysteresis), ("reach", self.reach)):
             has_shape(name, value, {"one number": ()})
@@ -75,7 +75,7 @@ class Fusing(Rule):
     refreezing: Refreezing | None
     springs: Springs | None
 
-    def __init__(self, net: Topology, melting: Any, refreezing: Refreezing | None = None):
+    def __init__(self, net: Topology, melting: Numbers, refreezing: Refreezing | None = None):
         self.net = net
         self.melting = as_inexact("melting", melting)
         has_shape("melting", self.melting, {"one number": ()})

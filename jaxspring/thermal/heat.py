@@ -10,7 +10,7 @@ Source: slides "Heating and Melting", "Heat Equation (Discretised)".
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -19,6 +19,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from .._arrays import Numbers, SpringNumbers
 from .._checks import as_inexact, finite, nonnegative, positive
 from ..forces.base import Rule, Step, any_refused
 from ..linalg.operators import SpringBlocks
@@ -78,11 +79,11 @@ class Heat(Rule):
     def __init__(
         self,
         net: Topology,
-        capacity: Any,
-        conductance: Any,
+        capacity: Numbers,
+        conductance: SpringNumbers,
         scheme: HeatScheme | None = None,
-        boundaries: Any = (),
-        source: Any = None,
+        boundaries: ThermalBoundary | Sequence[ThermalBoundary] = (),
+        source: Numbers | Callable[[Array], Numbers] | None = None,
         substeps: int = 1,
         every: int = 1,
         latent: LatentHeat | None = None,

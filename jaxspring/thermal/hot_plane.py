@@ -10,12 +10,13 @@ Source: the hot constraint surfaces of Terzopoulos, Platt and Fleischer (1989); 
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from .._arrays import Numbers
 from .._checks import as_inexact, finite, has_shape, node_values, nonnegative, plane
 from ..forces.base import any_refused
 from ..state import State
@@ -49,7 +50,16 @@ class HotPlane(ThermalBoundary):
     reach: Array
     fade: Array
 
-    def __init__(self, point: Any, normal: Any, temperature: Any, coefficient: Any, area: Any, reach: Any, fade: Any = 0.0):
+    def __init__(
+        self,
+        point: Numbers,
+        normal: Numbers,
+        temperature: Numbers,
+        coefficient: Numbers,
+        area: Numbers,
+        reach: Numbers,
+        fade: Numbers = 0.0,
+    ):
         """Check what is given.
 
         Args:

@@ -12,12 +12,11 @@ Source: Voller, Cross and Markatos (1987); the variable is enthalpy over capacit
 
 from __future__ import annotations
 
-from typing import Any
-
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from .._arrays import Numbers
 from .._checks import node_values, nonnegative
 from ..forces.base import any_refused
 from ..topology.base import Topology
@@ -37,7 +36,7 @@ class LatentHeat(eqx.Module):
     melting: Array
     latent: Array
 
-    def __init__(self, melting: Any, latent: Any):
+    def __init__(self, melting: Numbers, latent: Numbers):
         self.melting = node_values("melting", melting)
         self.latent = node_values("latent", latent)
         nonnegative("latent", self.latent, "Melting takes heat up.")

@@ -18,7 +18,8 @@ Source: first law; the split of kicks is that of m (v''^2 - v^2) / 2 = (dt F + J
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -34,6 +35,9 @@ from ..status import Status
 from ..topology.base import Topology
 from ..vector import Vector
 from .heat import Heat, total_heat
+
+if TYPE_CHECKING:
+    from ..system import System
 
 
 class Account(eqx.Module):
@@ -80,7 +84,7 @@ class Ledger(Rule):
     forces: tuple[Force, ...] | None
     mass: Array | None
 
-    def __init__(self, rules: Any = ()):
+    def __init__(self, rules: Rule | Sequence[Rule] = ()):
         self.rules = (rules,) if isinstance(rules, Rule) else tuple(rules)
         for i, rule in enumerate(self.rules):
             if not isinstance(rule, Rule) or isinstance(rule, (Force, Ledger)):
@@ -234,7 +238,7 @@ class Ledger(Rule):
         return jnp.asarray(self.mass, state.dtype)
 
 
-def energy_ledger(system: Any, state: State) -> dict[str, Any]:
+def energy_ledger(system: System, state: State) -> dict[str, Any]:
     """The books of a run as names and numbers; for the host.
 
     Args:

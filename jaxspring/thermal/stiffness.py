@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .._arrays import Numbers, SpringNumbers
 from .._checks import as_inexact, finite, has_shape, is_concrete, nonnegative, positive
 from ..forces.base import any_refused
 from ..forces.living import map_living
@@ -55,7 +56,7 @@ class ThermalStiffness(StiffnessRule):
     melting: Array
     sharpness: Array | None
 
-    def __init__(self, stiffness: Any, softening: Any, melting: Any, sharpness: Any = None):
+    def __init__(self, stiffness: SpringNumbers, softening: Numbers, melting: Numbers, sharpness: Numbers | None = None):
         self.full = stiffness if isinstance(stiffness, EdgeField) else as_inexact("stiffness", stiffness)
         if not isinstance(self.full, EdgeField) and self.full.ndim > 1:
             raise ValueError(f"stiffness has shape {self.full.shape}; expected () (one number), or (E,) (one per spring).")
@@ -113,7 +114,7 @@ class ThermalExpansion(ExpansionRule):
     coefficient: Array
     reference: Array
 
-    def __init__(self, coefficient: Any, reference: Any):
+    def __init__(self, coefficient: Numbers, reference: Numbers):
         self.coefficient, self.reference = _number("coefficient", coefficient), _number("reference", reference)
 
     def factor(self, net: Topology, state: State) -> EdgeField:

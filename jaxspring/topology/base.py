@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._arrays import own
+from .._arrays import Numbers, SpringNumbers, own
 from .._checks import as_inexact, finite, has_shape, shape_of
 from ..vector import Vector
 from .edge_field import EdgeField
@@ -121,7 +121,7 @@ class Topology(eqx.Module):
     def split(self, flat: Array) -> EdgeField:
         """(E,) array in the user's order -> edge field."""
 
-    def flatten(self, field: Any) -> Array:
+    def flatten(self, field: Numbers | EdgeField) -> Array:
         """Edge field -> (E,) array in the user's order. One number is repeated; what is (E,) already comes back as it is."""
         if isinstance(field, EdgeField):
             return self._flatten(self._spread(field))
@@ -191,7 +191,7 @@ class Topology(eqx.Module):
         columns = [f.families if isinstance(f, EdgeField) else (f,) * count for f in fields]
         return self.own(law(*entries) for entries in zip(*columns, strict=True))
 
-    def edge_field(self, value: Any, name: str = "value") -> Array | EdgeField:
+    def edge_field(self, value: SpringNumbers, name: str = "value") -> Array | EdgeField:
         """A number, an (E,) array in the user's order, an edge field, or on a lattice numbers by family, in the shape of the topology.
 
         Numbers by family are a mapping such as `{js.STRUCTURAL: 100.0, js.SHEAR: 50.0}`, which names every family of the lattice, or an
@@ -205,7 +205,7 @@ class Topology(eqx.Module):
             return self._spread(value)
         return self.split(value) if value.ndim else value
 
-    def edge_constant(self, value: Any, name: str = "value") -> Array | EdgeField:
+    def edge_constant(self, value: SpringNumbers, name: str = "value") -> Array | EdgeField:
         """What `edge_field` takes, checked and as floating arrays, but in the form it was passed: its gradient comes back in that form.
 
         Numbers by family become an edge field with one number for each family.
@@ -241,7 +241,7 @@ class Topology(eqx.Module):
         families = tuple(jnp.broadcast_to(a, shape) for a, shape in zip(field.families, self.family_shapes, strict=True))
         return dataclasses.replace(field, families=families)
 
-    def node_field(self, value: Any, name: str = "value") -> Array:
+    def node_field(self, value: Numbers, name: str = "value") -> Array:
         """A number, an (N,) array in the user's order, or an array in node shape, as a node array (a number stays 0-d)."""
         value = own(name, value)
         allowed = {"one number": (), "one per node": (self.n_nodes,), "node shape": self.node_shape}
@@ -250,7 +250,7 @@ class Topology(eqx.Module):
             return value
         return self._order_nodes(value)
 
-    def vector_field(self, points: Any, name: str = "points") -> Vector:
+    def vector_field(self, points: Numbers, name: str = "points") -> Vector:
         """(N, D) array in the user's order -> `Vector` in node shape, D = 1, 2 or 3."""
         points = as_inexact(name, points)
         if points.ndim != 2 or points.shape[0] != self.n_nodes or points.shape[1] not in (1, 2, 3):
@@ -264,7 +264,7 @@ class Topology(eqx.Module):
         a = own("a", a)
         return self.layout.flatten(a if a.ndim else jnp.broadcast_to(a, self.node_shape))
 
-    def lengths(self, position: Any) -> Array:
+    def lengths(self, position: Numbers | Vector) -> Array:
         """(E,) lengths of the springs [m] in the user's order, for a `Vector` or an (N, D) array of positions."""
         x = position if isinstance(position, Vector) else self.vector_field(about_middle(position), "position")
         if x.shape != self.node_shape:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from .._arrays import given, on_host
+from .._arrays import Numbers, given, on_host
 from .._checks import finite, triangle_indices
 from .graph import Graph
 from .reduction import Gather, Scatter
@@ -20,7 +20,7 @@ Reductions = type[Gather] | type[Scatter] | None
 ROUNDING = 8
 
 
-def from_triangles(triangles: Any, n_nodes: int, *, reduction: Reductions = None) -> Graph:
+def from_triangles(triangles: Numbers, n_nodes: int, *, reduction: Reductions = None) -> Graph:
     """A spring along every side of every triangle, one per side; the triangles are kept as `net.triangles`.
 
     Args:
@@ -43,7 +43,7 @@ def from_triangles(triangles: Any, n_nodes: int, *, reduction: Reductions = None
     return Graph.from_edges(_sides(corners), n_nodes, triangles=corners, reduction=reduction)
 
 
-def delaunay(points: Any, *, reduction: Reductions = None) -> Graph:
+def delaunay(points: Numbers, *, reduction: Reductions = None) -> Graph:
     """Springs along the Delaunay triangulation of points in the plane, or tetrahedralisation of points in space.
 
     Args:

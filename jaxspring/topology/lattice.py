@@ -19,7 +19,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from .._arrays import whole_number
+from .._arrays import Numbers, whole_number
 from .._checks import is_concrete
 from ..numerics import linear_call
 from ..vector import Vector
@@ -245,7 +245,7 @@ def lattice(
     shape: int | Sequence[int],
     springs: SpringFamilies = STRUCTURAL,
     periodic: bool | Sequence[bool] = False,
-    box: Any = None,
+    box: Numbers | None = None,
 ) -> Lattice:
     """A chain, a sheet or a block of nodes: shape n or (n,), (ny, nx), (nz, ny, nx).
 

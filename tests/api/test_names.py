@@ -7,7 +7,7 @@ import re
 import types
 
 import jaxspring as js
-from tests import source
+from tests import face, source
 
 
 def public() -> dict[str, object]:
@@ -21,6 +21,11 @@ def test_every_public_name_resolves_and_is_listed_once():
     assert [name for name in js.__all__ if name.startswith("_") and name != "__version__"] == []
     assert [name for name in js.__all__ if not hasattr(js, name)] == []
     assert set(js.__all__) <= set(dir(js))
+
+
+def test_type_checkers_see_the_same_names():
+    """The imports under TYPE_CHECKING are those of the table; `python -m tests.face` writes them."""
+    assert face.written(face.FILE.read_text()) == face.block()
 
 
 def test_an_unknown_name_is_an_attribute_error():

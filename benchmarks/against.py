@@ -35,7 +35,8 @@ def workloads() -> dict[str, Callable[[], Callable[[], Any]]]:
         return lambda: scenes.rollout_positions(system, state, explicit.DT, n_steps)
 
     def gradient(make: Any, size: int, n_steps: int) -> Any:
-        function, arrays = scenes.gradient_program(*make(size), explicit.DT, n_steps)
+        system, state = make(size)
+        function, arrays = scenes.gradient_program(system, state, explicit.DT, n_steps)
         return lambda: function(*arrays)
 
     def implicit(size: int, n_steps: int) -> Any:

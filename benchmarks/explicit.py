@@ -29,10 +29,10 @@ def lattices(sizes: list[tuple[int, int]], rounds: int) -> list[dict]:
     rows = []
     for n, n_steps in sizes:
         system, state = scenes.sheet(n)
-        bare, k, l = scenes.bare_sheet(system.net, system, n_steps)
+        bare, k, l = scenes.bare_sheet(system, n_steps)
         x, v = list(state.position), list(state.velocity)
         edge_list = scenes.bare_edge_list(system.net.edges, max(n_steps // 10, 1))
-        springs = system.forces[0]
+        springs = scenes.springs_of(system)
 
         def run(system: js.System = system, state: js.State = state, n_steps: int = n_steps) -> js.Result:
             return scenes.rollout_positions(system, state, DT, n_steps)

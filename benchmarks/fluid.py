@@ -43,10 +43,10 @@ def liquid(n: int) -> tuple[np.ndarray, np.ndarray]:
 
 def exact(points: np.ndarray) -> tuple[np.ndarray, int]:
     """(N, 3) forces in float64, and how many pairs are nearer than the cut-off."""
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     at = points.astype(np.float64)
-    i, j = cKDTree(at).query_pairs(REACH, output_type="ndarray").T
+    i, j = KDTree(at).query_pairs(REACH, output_type="ndarray").T
     d = at[i] - at[j]
     squared = np.sum(d * d, axis=1)
     weight = 24 / squared * (2 * squared**-6 - squared**-3) - fluid_peers.end_force(REACH) / np.sqrt(squared)
@@ -86,7 +86,7 @@ def costs(points: np.ndarray, speeds: np.ndarray, rounds: int) -> dict[str, floa
     system, state = begun(points, speeds)
 
     def squared_forces(x: js.Vector) -> jax.Array:
-        return sum(jnp.sum(a * a) for a in system.force(state.moved(x, state.velocity)))
+        return jnp.sum(jnp.stack([jnp.sum(a * a) for a in system.force(state.moved(x, state.velocity))]))
 
     force, gradient = jax.jit(lambda s: system.force(s)), jax.jit(lambda s: jax.grad(squared_forces)(s.position))
     begin = jax.jit(lambda s: system.begin(eqx.tree_at(lambda s: s.neighbours, s, None)))

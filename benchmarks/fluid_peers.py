@@ -106,7 +106,7 @@ def numba(points: np.ndarray, speeds: np.ndarray, reach: float, skin: float) -> 
     nb = load("numba")
     if nb is None:
         return None
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     order = np.lexsort(np.floor(points / (reach + skin)).T)
     start_at, start_speed = points[order].astype(np.float32), speeds[order].astype(np.float32)
@@ -129,7 +129,7 @@ def numba(points: np.ndarray, speeds: np.ndarray, reach: float, skin: float) -> 
             out[i, 0], out[i, 1], out[i, 2] = fx, fy, fz
 
     def find(at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        pairs = cKDTree(at).query_pairs(reach + skin, output_type="ndarray")
+        pairs = KDTree(at).query_pairs(reach + skin, output_type="ndarray")
         both = np.concatenate([pairs, pairs[:, ::-1]])
         both = both[np.lexsort((both[:, 1], both[:, 0]))].astype(np.int32)
         return np.searchsorted(both[:, 0], np.arange(len(at) + 1)).astype(np.int32), np.ascontiguousarray(both[:, 1])
@@ -145,8 +145,8 @@ def numba(points: np.ndarray, speeds: np.ndarray, reach: float, skin: float) -> 
         fill(start_at, *ready, out)
         return unsorted(out)
 
-    def steps(dt: float, n_steps: int) -> Callable[[], tuple[Any, int]]:
-        dt = np.float32(dt)
+    def steps(given_dt: float, n_steps: int) -> Callable[[], tuple[Any, int]]:
+        dt = np.float32(given_dt)
 
         def run() -> tuple[Any, int]:
             x, v, near, reference, remade = start_at.copy(), start_speed.copy(), ready, start_at, 0

@@ -30,7 +30,7 @@ def lattices(sizes: list[tuple[int, int]], rounds: int) -> list[dict]:
     rows = []
     for n, n_steps in sizes:
         system, state = scenes.sheet(n)
-        bare, k, l = scenes.bare_sheet(system.net, system, n_steps)
+        bare, k, l = scenes.bare_sheet(system, n_steps)
         timed = measure(
             [
                 Case("bare", bare, (list(state.position), list(state.velocity), k, l, DT)),

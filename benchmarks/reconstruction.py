@@ -33,7 +33,7 @@ def images(quick: bool) -> Iterator[tuple[str, js.Image]]:
     if not quick:
         from matplotlib.cbook import get_sample_data
 
-        heights = np.asarray(get_sample_data("topobathy.npz")["topo"], np.float32)
+        heights = np.asarray(dict(get_sample_data("topobathy.npz"))["topo"], np.float32)
         yield "topobathy (elevation)", js.Image(heights)
     for name in PHOTOGRAPHS[:1] if quick else PHOTOGRAPHS:
         yield name, js.Image(np.asarray(getattr(data, name)()))

@@ -45,6 +45,12 @@ def _hung(net: Any, flat: np.ndarray, rest: np.ndarray, rng: np.random.Generator
     return system, js.State.from_points(net, points)
 
 
+def springs_of(system: js.System) -> js.Springs:
+    """The springs of a scene, its first force."""
+    (springs, *_) = (force for force in system.forces if isinstance(force, js.Springs))
+    return springs
+
+
 def rollout_positions(system: js.System, state: js.State, dt: Any, n_steps: int) -> js.Result:
     """A rollout as a user calls it, with its statuses on."""
     return js.rollout(system, state, js.SymplecticEuler(), dt, n_steps)
@@ -63,7 +69,8 @@ def program(system: js.System, state: js.State, dt: Any, n_steps: int) -> tuple[
 def gradient_program(system: js.System, state: js.State, dt: Any, n_steps: int, observe: bool = False) -> tuple[Any, tuple[Any, ...]]:
     """The gradient of the sum of squared last positions with respect to every k and l, passed flat in the user's order."""
     arrays, static = eqx.partition(system, eqx.is_array)
-    constants = (system.forces[0].stiffness, system.forces[0].rest_length)
+    springs = springs_of(system)
+    constants = (springs.stiffness, springs.rest_length)
 
     def loss(constants: Any, arrays: Any, state: js.State, dt: Any) -> Any:
         whole = eqx.combine(arrays, static)
@@ -81,15 +88,17 @@ def _height(state: js.State) -> jax.Array:
     return jnp.mean(state.position.z * state.position.z)
 
 
-def bare_sheet(net: js.Lattice, system: js.System, n_steps: int) -> Any:
+def bare_sheet(system: js.System, n_steps: int) -> Any:
     """The same arithmetic by hand: component arrays, shifted slices, padded sums, the unguarded k (1 - l rsqrt), nothing else."""
+    net = system.net
+    assert isinstance(net, js.Lattice)
     shapes = [tuple(n - abs(o) for n, o in zip(net.shape, offset, strict=True)) for offset in net.offsets]
     sizes = np.cumsum([0, *(int(np.prod(s)) for s in shapes)])
 
     def cut(flat: Any) -> list[Any]:
         return [jnp.asarray(flat[a:b]).reshape(s) for a, b, s in zip(sizes[:-1], sizes[1:], shapes, strict=True)]
 
-    springs = system.forces[0]
+    springs = springs_of(system)
     k, l = cut(springs.stiffness), cut(springs.rest_length)
 
     def step(carry: Any, k: Any, l: Any, dt: Any) -> Any:
@@ -129,7 +138,8 @@ def bare_edge_list(edges: np.ndarray, n_steps: int) -> Any:
 
 def bare_mesh(system: js.System, state: js.State, dt: Any, n_steps: int) -> tuple[Any, tuple[Any, ...]]:
     """Component arrays on the graph's own order, gathers and scatter-add, unguarded; and the arguments."""
-    net, springs = system.net, system.forces[0]
+    net, springs = system.net, springs_of(system)
+    assert isinstance(net, js.Graph)
     tails, heads = net.tails, net.heads
     k, l = (net.split(a).families[0] for a in (springs.stiffness, springs.rest_length))
 
@@ -149,7 +159,7 @@ def bare_mesh(system: js.System, state: js.State, dt: Any, n_steps: int) -> tupl
 
 def numpy_positions(system: js.System, state: js.State, dt: float, n_steps: int) -> np.ndarray:
     """The same steps in NumPy and float64, by bincount: the reference for every error quoted."""
-    springs = system.forces[0]
+    springs = springs_of(system)
     tail, head = system.net.edges.T
     k, l = (np.asarray(a, float) for a in (springs.stiffness, springs.rest_length))
     x, v = (np.asarray(a, float) for a in (state.points, state.velocities))

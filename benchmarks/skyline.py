@@ -99,7 +99,7 @@ def problems(sizes: list[int], graph_sizes: list[int]) -> list[Problem]:
 def solve_once(case: Problem, rounds: int) -> dict[str, Any]:
     """Factor and solve, ours and SciPy's, in interleaved rounds."""
     lower = scipy.sparse.tril(case.sparse).tocoo()
-    banded = np.zeros((int((lower.row - lower.col).max()) + 1, lower.shape[0]))
+    banded = np.zeros((int((lower.row - lower.col).max()) + 1, case.sparse.shape[0]))
     banded[lower.row - lower.col, lower.col] = lower.data
     clock = Stopwatch()
     factor = jax.jit(lambda matrix: case.skyline.factor(shared(matrix))).lower(case.matrix).compile()

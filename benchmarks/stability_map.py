@@ -84,7 +84,7 @@ def draw(maps: dict[str, np.ndarray], k: np.ndarray, dt: np.ndarray, highest: fl
     figure = Figure(figsize=(11, 9.5), layout="constrained")
     norm, colors = BoundaryNorm(np.arange(len(OUTCOMES) + 1) - 0.5, len(OUTCOMES)), ListedColormap(COLORS)
     grid: Any = figure.subplots(3, 3, sharex=True, sharey=True)
-    mesh = None
+    mesh: Any = None
     for axes, (name, cells) in zip(grid.ravel(), maps.items(), strict=True):
         mesh = axes.pcolormesh(k, dt, cells.T, cmap=colors, norm=norm, shading="nearest")
         axes.plot(k, 2 / (highest * np.sqrt(k)), "k--", linewidth=1, label="omega dt = 2")

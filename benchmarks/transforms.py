@@ -69,7 +69,9 @@ def heat(scheme: js.HeatScheme) -> Function:
         start = js.State.from_points(net, np.asarray(net.grid(), float), temperature=temperature)
         rule = js.Heat(net, 2.0 * p[1], 3.0 * p[0], scheme=scheme)
         system = js.System(net, 1.0, rules=rule)
-        return js.rollout(system, start, js.Still(), 0.1, 2).state.temperature.ravel() / 300
+        temperatures = js.rollout(system, start, js.Still(), 0.1, 2).state.temperature
+        assert temperatures is not None
+        return temperatures.ravel() / 300
 
     return end
 
@@ -110,7 +112,8 @@ def melting(p: jax.Array) -> jax.Array:
     system = eqx.tree_at(constants, scene.system, (p[0] * full, p[1] * conductance))
     start = js.State.from_points(scene.net, points, temperature=np.repeat([360.0, 340.0, 310.0], 4))
     state = js.rollout(system, start, js.SymplecticEuler(), 4e-4, 2).state
-    return jnp.concatenate([state.velocities.ravel(), jnp.ravel(state.temperature) / 300])
+    assert state.temperature is not None
+    return jnp.concatenate([state.velocities.ravel(), state.temperature.ravel() / 300])
 
 
 STEPPERS: dict[str, Function] = {

@@ -162,7 +162,7 @@ def rows_of(scene: Scene, method: Method, expected: tuple[np.ndarray, float], ha
 
 def timed(run: Callable[..., Any], constant: Any, setting: Any, rounds: int = 3) -> tuple[Any, float]:
     """The result, and the median of some runs after the first; the first alone where it is long."""
-    seconds = []
+    seconds, result = [], None
     for i in range(rounds + 1):
         clock = Stopwatch()
         result = jax.block_until_ready(run(constant, setting))

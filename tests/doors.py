@@ -6,7 +6,7 @@ here nor among those that take no array of the user's.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -118,10 +118,10 @@ DOORS: dict[str, Door] = {
     "LatentHeat": Door(js.LatentHeat, {"melting": per_node(350), "latent": per_node()}),
     "LennardJones": Door(js.LennardJones, {"epsilon": number(2.0), "sigma": number(0.5)}),
     "Load": Door(lambda forces: js.Load.from_points(net(), forces), {"forces": np.arange(8.0).reshape(N, 2)}),
-    "Motion": Door(lambda moved: js.Motion(moved, lambda t: t), {"moved": PATTERN}),
+    "Motion": Door(lambda moved: js.Motion(moved, lambda t: js.Vector((t,))), {"moved": PATTERN}),
     "NeighbourList": Door(lambda skin: js.NeighbourList(8, skin), {"skin": number(0.5)}),
     "PairDrag": Door(js.PairDrag, {"damping": number(2.0), "radius": number(1.5)}),
-    "PixelSprings": Door(lambda stiffness: js.PixelSprings(None, stiffness), {"stiffness": number(2.0)}),
+    "PixelSprings": Door(lambda stiffness: js.PixelSprings(cast(Any, None), stiffness), {"stiffness": number(2.0)}),
     "PlainCutoff": Door(js.PlainCutoff, {"radius": number(2.5)}),
     "Radiation": Door(
         lambda **a: js.Radiation(net(), **a),

@@ -92,6 +92,8 @@ class PlainCutoff(_AtRadius):
         radius: [m].
     """
 
+    __init__ = _AtRadius.__init__  # said again for type checkers, which would make one of the fields
+
     def weight(self, law: PairLaw, squared: Array) -> Array:
         """The law's w below the radius, zero from it on."""
         return _below(squared, self.radius, law.weight(squared))
@@ -110,6 +112,8 @@ class ShiftedForce(_AtRadius):
     Attributes:
         radius: [m].
     """
+
+    __init__ = _AtRadius.__init__  # said again for type checkers, which would make one of the fields
 
     def weight(self, law: PairLaw, squared: Array) -> Array:
         """The law's w - F(c) / r below the radius, zero from it on."""

@@ -168,6 +168,8 @@ class ImplicitStepper(Stepper):
 class BackwardEuler(ImplicitStepper):
     """Backward Euler: one linear solve, or a converged step with `newton=True`."""
 
+    __init__ = ImplicitStepper.__init__  # said again for type checkers, which would make one of the fields
+
     @classmethod
     def is_newton_by_default(cls) -> bool:
         """No: one linear solve keeps order 1."""
@@ -187,6 +189,8 @@ class ImplicitMidpoint(ImplicitStepper):
 
     It keeps the energy of linear systems. Motions above the step's resolution ring without dying out: `BDF2` damps them.
     """
+
+    __init__ = ImplicitStepper.__init__  # said again for type checkers, which would make one of the fields
 
     @classmethod
     def is_newton_by_default(cls) -> bool:
@@ -209,6 +213,8 @@ class ImplicitMidpoint(ImplicitStepper):
 
 class BDF2(ImplicitStepper):
     """The two-step backward differentiation formula, converged unless `newton=False`; its first step is backward Euler's."""
+
+    __init__ = ImplicitStepper.__init__  # said again for type checkers, which would make one of the fields
 
     @classmethod
     def is_newton_by_default(cls) -> bool:

@@ -70,6 +70,8 @@ class BackwardEulerHeat(_Solved):
         iteration: how far the iteration goes where the power is not linear.
     """
 
+    __init__ = _Solved.__init__  # said again for type checkers, which would make one of the fields
+
     def advance(self, flow: Flow, y: Array, dt: Array) -> tuple[Array, Status]:
         """One backward step."""
         return BackwardStep(self.solver, self.iteration).solve(flow.at(flow.state.time + dt), y, dt)
@@ -82,6 +84,8 @@ class CrankNicolsonHeat(_Solved):
         solver: `JaxCG()` unless said.
         iteration: how far the iteration goes where the power is not linear.
     """
+
+    __init__ = _Solved.__init__  # said again for type checkers, which would make one of the fields
 
     def advance(self, flow: Flow, y: Array, dt: Array) -> tuple[Array, Status]:
         """Half an explicit step, half a backward one."""

@@ -92,9 +92,9 @@ class Reconstruction(eqx.Module):
         free[[0, -1], :, 1] = False
         return free.reshape(-1, dim)
 
-    def system(self, stiffness: Array, mass_of: Array, damping: float) -> System:
+    def system(self, stiffness: Array | np.ndarray, mass_of: Array | np.ndarray, damping: float) -> System:
         """The mesh in the plane, positions (x, y): (E,) stiffness [N/m], and mass and drag by the stiffnesses `mass_of` (E,) [N/m]."""
-        mass = self.net.incident_sum(self.net.split(mass_of))
+        mass = self.net.incident_sum(self.net.split(jnp.asarray(mass_of)))
         springs = Springs(self.net, stiffness, 0.0, axes=(0, 1))
         return System(self.net, mass, (springs, Drag(damping * mass)), free=self.sliding(2))
 
@@ -127,7 +127,7 @@ class Reconstruction(eqx.Module):
         position = Vector((x, y))
         return State(jnp.zeros((), x.dtype), position, Vector.zeros_like(position), self.net.layout)
 
-    def relax(self, stiffness: Array, start: State, relaxation: Relaxation, mass_of: Array | None = None) -> Result:
+    def relax(self, stiffness: Array | np.ndarray, start: State, relaxation: Relaxation, mass_of: Array | None = None) -> Result:
         """Damped steps from `start` toward the equilibrium of `stiffness` (E,) [N/m]; mass by `mass_of`, or by the springs themselves."""
         system = self.system(stiffness, stiffness if mass_of is None else mass_of, relaxation.damping)
         return rollout(system, start, SymplecticEuler(), dt=relaxation.dt, n_steps=relaxation.n_steps)

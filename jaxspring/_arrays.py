@@ -10,7 +10,7 @@ from __future__ import annotations
 import numbers
 from collections.abc import Iterable, Mapping, Sequence, Set
 from decimal import Decimal
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -19,14 +19,8 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
-if TYPE_CHECKING:
-    from .topology.edge_field import EdgeField
-    from .topology.lattice import SpringFamilies
-
 # What a user may pass for numbers: a scalar, an array of any library, nested lists.
 Numbers: TypeAlias = "ArrayLike | Sequence[Numbers]"
-# The same for springs: also a field of the net, or on a lattice numbers by family.
-SpringNumbers: TypeAlias = "Numbers | EdgeField | Mapping[SpringFamilies, Numbers]"
 
 BUILD_OUTSIDE = "Build the net outside of jit, grad and vmap, and pass it in: one net is one program."
 

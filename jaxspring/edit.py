@@ -8,11 +8,12 @@ from typing import Any
 
 import equinox as eqx
 
-from ._arrays import Numbers, SpringNumbers
+from ._arrays import Numbers
 from ._checks import is_concrete
 from .forces.adaptive import ImageStiffness
 from .forces.base import Force
 from .system import System
+from .topology.edge_field import SpringNumbers
 
 
 def replace(

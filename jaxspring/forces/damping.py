@@ -15,14 +15,14 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from .._arrays import Numbers, SpringNumbers
+from .._arrays import Numbers
 from .._checks import node_values, nonnegative
 from ..linalg.operators import Blocks, SpringBlocks, isotropic
 from ..numerics import cast_inexact, tiny
 from ..state import State
 from ..status import Flag
 from ..topology.base import Topology
-from ..topology.edge_field import EdgeField
+from ..topology.edge_field import EdgeField, SpringNumbers
 from ..vector import Vector
 from .base import Finding, Force, any_refused
 from .in_box import long_springs, turned_springs

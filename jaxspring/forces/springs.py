@@ -17,14 +17,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._arrays import SpringNumbers, whole_number
+from .._arrays import whole_number
 from .._checks import finite, is_concrete, nonnegative, positive
 from ..linalg.operators import Blocks, SpringBlocks
 from ..numerics import cast_inexact, tiny
 from ..state import State
 from ..status import Flag
 from ..topology.base import Topology
-from ..topology.edge_field import EdgeField, ZeroOutside
+from ..topology.edge_field import EdgeField, SpringNumbers, ZeroOutside
 from ..topology.periods import box_of
 from ..vector import Vector
 from .base import Finding, Force, any_refused

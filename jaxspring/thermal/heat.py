@@ -19,7 +19,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from .._arrays import Numbers, SpringNumbers
+from .._arrays import Numbers
 from .._checks import as_inexact, finite, nonnegative, positive
 from ..forces.base import Rule, Step, any_refused
 from ..linalg.operators import SpringBlocks
@@ -27,7 +27,7 @@ from ..numerics import cast_inexact, stopped
 from ..state import State
 from ..status import Flag, Status
 from ..topology.base import Topology
-from ..topology.edge_field import EdgeField
+from ..topology.edge_field import EdgeField, SpringNumbers
 from ..topology.lattice import Lattice
 from .boundaries import ThermalBoundary
 from .flow import Flow

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._arrays import Numbers, SpringNumbers
+from .._arrays import Numbers
 from .._checks import as_inexact, finite, has_shape, is_concrete, nonnegative, positive
 from ..forces.base import any_refused
 from ..forces.living import map_living
@@ -28,7 +28,7 @@ from ..forces.springs import ExpansionRule, StiffnessRule
 from ..numerics import cast_inexact
 from ..state import State
 from ..topology.base import Topology
-from ..topology.edge_field import EdgeField
+from ..topology.edge_field import EdgeField, SpringNumbers
 
 
 class ThermalStiffness(StiffnessRule):

@@ -21,10 +21,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._arrays import Numbers, SpringNumbers, own
+from .._arrays import Numbers, own
 from .._checks import as_inexact, finite, has_shape, shape_of
 from ..vector import Vector
-from .edge_field import EdgeField
+from .edge_field import EdgeField, SpringNumbers
 from .identity import NetIdentity
 from .periods import box_of, check_dim
 from .permutation import Permutation

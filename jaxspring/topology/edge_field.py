@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._arrays import kept, own
+from .._arrays import Numbers, kept, own
 from .._checks import shape_of
 from .identity import NetIdentity
+
+# What a user may pass for springs: numbers, a field of the net, or on a lattice numbers by family.
+SpringNumbers: TypeAlias = "Numbers | EdgeField | Mapping[Any, Numbers]"
 
 
 def _kept(families: Any) -> Any:

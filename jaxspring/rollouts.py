@@ -21,6 +21,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
+from . import printing
 from ._arrays import Numbers
 from ._checks import as_inexact, finite, has_shape, is_concrete
 from .blocks import Adjoint, Checkpointed, Plan, make_plan, run_blocks
@@ -90,6 +91,12 @@ class Result(eqx.Module):
     info: Info
     resume: Resume
     effects: tuple[str, ...] = eqx.field(static=True)
+
+    def __str__(self) -> str:
+        """A few lines for a person."""
+        status = str(self.status) if is_traced(self.status) else self.status.describe(self.effects)
+        frames = [] if self.saved is None else [f"frames of {type(self.saved).__name__} in `saved`"]
+        return printing.under(f"Result after {printing.numbers(self.info.n_steps)} steps: {status}", [str(self.state), *frames])
 
 
 def rollout(

@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ._arrays import kept
+from . import printing
+from ._arrays import Numbers, kept
 from ._checks import as_inexact, finite, has_shape
 from .topology.base import NodeLayout, Topology
 from .topology.edge_field import EdgeField
@@ -46,8 +47,14 @@ class State(eqx.Module):
     neighbours: Any = None
     ledger: Any = None
 
+    def __str__(self) -> str:
+        """A few lines for a person."""
+        return printing.state(self)
+
     @staticmethod
-    def from_points(net: Topology, points: Any, velocities: Any = None, time: Any = 0.0, temperature: Any = None) -> State:
+    def from_points(
+        net: Topology, points: Numbers, velocities: Numbers | None = None, time: Numbers = 0.0, temperature: Numbers | None = None
+    ) -> State:
         """A state from (N, D) arrays in the user's node order.
 
         Args:

@@ -94,6 +94,10 @@ class Status(eqx.Module):
     effect: Int[Array, "*batch"]
     count: Int[Array, "*batch"]
 
+    def __str__(self) -> str:
+        """What went wrong, in words; the tree where it is traced."""
+        return repr(self) if isinstance(self.flags, Tracer) else self.describe()
+
     @staticmethod
     def ok() -> Status:
         """A status with no flag."""

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from . import printing
 from ._arrays import Numbers, as_mask, kept
 from ._checks import as_inexact, has_shape, positive, shape_of
 from .forces.base import Force, Rule, Step
@@ -120,6 +121,10 @@ class System(eqx.Module):
         if motion is not None:
             moved = as_mask("motion.moved", motion.moved, ", True where a node follows the schedule")
             has_shape("motion.moved", moved, {"one per node": (net.n_nodes,), "node shape": net.node_shape})
+
+    def __str__(self) -> str:
+        """A few lines for a person."""
+        return printing.system(self)
 
     def __getstate__(self) -> dict[str, Any]:
         """What pickle stores. Raises PicklingError for a lambda, naming its field."""

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from .. import printing
 from ..linalg.operators import Blocks
 from ..numerics import cast_inexact
 from ..state import State
@@ -67,6 +68,10 @@ class Rule(eqx.Module):
     Rules run in the order in which the system names them, each on the state that the one before left; obstacles come last, together. A
     rule that gives the state another position or velocity tells the stepper so by that alone.
     """
+
+    def __str__(self) -> str:
+        """A line for a person."""
+        return printing.effect(self)
 
     @property
     def obstacles(self) -> tuple[Rule, ...]:

@@ -14,6 +14,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from .. import printing
 from .._arrays import own
 from ..numerics import is_traced
 from ..progress import Progress, Stopwatch
@@ -79,6 +80,12 @@ class Fit:
     reason: StopReason
     undetermined: Undetermined | None
     explanation: str
+
+    def __str__(self) -> str:
+        """A few lines for a person."""
+        named, _ = jax.tree_util.tree_flatten_with_path(eqx.filter(self.parameters, eqx.is_array))
+        lines = [f"{jax.tree_util.keystr(path)} {printing.numbers(leaf)}" for path, leaf in named]
+        return printing.under(f"Fit: loss {self.value:.6g} at iteration {self.iteration}, {self.reason.name}; {self.explanation}", lines)
 
 
 @dataclass(frozen=True)

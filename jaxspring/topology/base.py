@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .. import printing
 from .._arrays import Numbers, own
 from .._checks import as_inexact, finite, has_shape, shape_of
 from ..vector import Vector
@@ -67,6 +68,10 @@ def about_middle(points: Any) -> Any:
 
 class Topology(eqx.Module):
     """Which nodes exist and which springs join them. Abstract: see `Lattice` and `Graph`."""
+
+    def __str__(self) -> str:
+        """A few lines for a person."""
+        return printing.net(self)
 
     @property
     @abc.abstractmethod

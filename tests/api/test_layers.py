@@ -13,6 +13,7 @@ LAYERS = {
     "_checks": 0,
     "numerics": 0,
     "facts": 0,
+    "printing": 0,
     "status": 0,
     "vector": 0,
     "archive": 0,  # files of arrays, whole or not at all

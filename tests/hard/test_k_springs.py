@@ -20,6 +20,7 @@ import jaxspring as js
 from jaxspring.archive import HEADER
 from jaxspring.forces.laws import has_no_direction, is_beyond_range, spring_block, spring_energy, spring_pull
 from jaxspring.resume import Origin
+from jaxspring.rollouts import Info
 from jaxspring.thermal.ledger import Account
 
 # A triangle whose last spring is broken, and the same without it.
@@ -503,7 +504,7 @@ def instances():
         *(js.Energy(number, (None,)), js.Finding(js.Flag.OUTSIDE, whole, whole), js.Flag.OK, status, js.StopReason.ITERATIONS),
         *(js.Equilibrium(state, info, whole, status, ("Springs",)), js.Solves(whole, number, status, info)),
         *(ode, js.OdeResult(state, None, number, status, ode, None, ("Springs",)), resume),
-        js.Result(state, None, status, None, resume, ("Springs",)),
+        js.Result(state, None, status, Info(None, whole), resume, ("Springs",)),
         *(fit, fit.history, js.Iteration(1, 1.0, 1.0, 1.0, True, None, None, None, {"k": number}), js.GradientCheck((), 1.0, status)),
         js.Undetermined(1, {"k": whole}, None, ("k",)),
     ]
@@ -543,6 +544,12 @@ def test_k6_pickle_and_deepcopy_give_the_same(name):
     if name == "Optax":
         pytest.skip("optax makes its transformations of local functions, which pickle cannot store")
     assert is_same(thing, pickle.loads(pickle.dumps(thing)))
+
+
+@pytest.mark.parametrize("name", INSTANCES)
+def test_k6_every_object_prints(name):
+    """`str` of every public object is text, whatever it holds."""
+    assert str(INSTANCES[name])
 
 
 @pytest.mark.parametrize("net", [js.lattice(3), WHOLE], ids=["lattice", "graph"])

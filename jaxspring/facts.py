@@ -37,6 +37,12 @@ def digest(found: tuple[Fact, ...]) -> str:
     return hashlib.sha256(repr(found).encode()).hexdigest()[:32]
 
 
+def of_functions(*trees: Any) -> str:
+    """What the functions in a scene hold, as text, by which a program is told from one of the same functions that held something else."""
+    held = [leaf for leaf in jax.tree.leaves(trees) if callable(leaf)]
+    return digest(facts(held)) if held else ""
+
+
 def _facts(value: Any, path: str, is_fixed: bool, depth: int, seen: set[int]) -> Iterator[Fact]:
     if depth == 0:
         return

@@ -25,7 +25,7 @@ from . import printing
 from ._arrays import Numbers
 from ._checks import as_inexact, finite, has_shape, is_concrete
 from .blocks import Adjoint, Checkpointed, Plan, make_plan, run_blocks
-from .facts import digest, facts
+from .facts import of_functions
 from .linalg.base import SolveInfo
 from .numerics import is_traced, stopped
 from .progress import LONG_RUN, N_CHUNKS, Progress
@@ -151,7 +151,7 @@ def rollout(
     plan = make_plan(n_steps, save_every, Checkpointed() if adjoint is None else adjoint, check_every)
     if resume is not None:
         check_kind(resume)
-    job = _Job(stepper, dt, observe, plan, keep_solves, _functions(system, observe))
+    job = _Job(stepper, dt, observe, plan, keep_solves, of_functions(system, observe))
     if is_traced(system, state, resume, job):
         return _compiled(system, state, resume, job, progress)
     result = _run_eagerly(system, state, resume, job, progress)
@@ -366,12 +366,6 @@ def _joined(first: Result, latest: Result) -> Info:
     if solves is not None and first.info.solves is not None:
         solves = first.info.solves.joined(solves)
     return Info(first.info.stable_dt, latest.info.n_steps, solves, latest.info.solves_saved)
-
-
-def _functions(*trees: Any) -> str:
-    """What the functions in a scene hold, as text, by which a program is told from one of the same functions that held something else."""
-    held = [leaf for leaf in jax.tree.leaves(trees) if callable(leaf)]
-    return digest(facts(held)) if held else ""
 
 
 def _checked_dt(dt: Any, state: State, stepper: Stepper) -> Array:

@@ -10,9 +10,9 @@ import textwrap
 from typing import Any
 
 import equinox as eqx
-import jax
 import numpy as np
-from jax.core import Tracer
+
+from .numerics import is_traced
 
 _INDENT = "  "
 
@@ -23,7 +23,7 @@ def numbers(values: Any) -> str:
     >>> print(numbers(np.array([2.0, 0.5, 1.0])), numbers(np.array([True, False])))
     0.5 to 2 1 of 2
     """
-    if isinstance(values, Tracer):
+    if is_traced(values):
         return f"{values.dtype}{list(values.shape)}, traced"
     if not isinstance(getattr(values, "dtype", np.dtype(float)), np.dtype):
         return str(values.dtype)  # keys of random numbers
@@ -55,10 +55,9 @@ def _said(value: Any, net: Any) -> str:
     if value is None or value is False:
         return ""
     if hasattr(value, "families") and hasattr(value, "identity"):  # an edge field
-        leaves = jax.tree.leaves(value)
-        return numbers(net.flatten(value)) if net is not None and not any(isinstance(leaf, Tracer) for leaf in leaves) else "per spring"
+        return "per spring" if net is None or is_traced(value) else numbers(net.flatten(value))
     if eqx.is_array(value):
-        return f"({numbers_of_each(value)})" if value.ndim == 1 and value.size <= 3 and not isinstance(value, Tracer) else numbers(value)
+        return f"({numbers_of_each(value)})" if value.ndim == 1 and value.size <= 3 and not is_traced(value) else numbers(value)
     if isinstance(value, tuple | list):
         return ", ".join(filter(None, (_said(entry, net) for entry in value)))
     if dataclasses.is_dataclass(value):
@@ -76,7 +75,7 @@ def net(thing: Any) -> str:
 
 def numbers_of_each(values: Any) -> str:
     """A short array, number by number."""
-    return numbers(values) if isinstance(values, Tracer) else ", ".join(f"{v:.6g}" for v in np.ravel(values))
+    return numbers(values) if is_traced(values) else ", ".join(f"{v:.6g}" for v in np.ravel(values))
 
 
 def state(thing: Any) -> str:
@@ -87,8 +86,8 @@ def state(thing: Any) -> str:
     head = f"{type(thing).__name__} of {nodes} nodes in {len(thing.position)} coordinates, {first.dtype}, at {numbers(thing.time)} s"
     head += f", a batch of {' x '.join(str(n) for n in batch)}" if batch else ""
     lines = [f"{name} {numbers(a)} m" for name, a in zip("xyz", thing.position, strict=False)]
-    if not isinstance(first, Tracer):
-        lines.append(f"speed {numbers(np.sqrt(sum(np.square(np.asarray(a, float)) for a in thing.velocity)))} m/s")
+    speed = "traced" if is_traced(thing.velocity) else f"{numbers(thing.velocity.norm())} m/s"
+    lines.append(f"speed {speed}")
     for name, unit in (("temperature", " K"), ("enthalpy", " J")):
         value = getattr(thing, name)
         if value is not None:

@@ -178,11 +178,8 @@ class Fluid(Force):
 
     def rounding(self, state: State) -> Array:
         """The largest coordinate's rounding over the equilibrium distance."""
-        return (
-            state.position.largest()
-            * jnp.asarray(jnp.finfo(state.dtype).eps, state.dtype)
-            / self.law.equilibrium_distance.astype(state.dtype)
-        )
+        eps = jnp.asarray(jnp.finfo(state.dtype).eps, state.dtype)
+        return state.position.largest() * eps / self.law.equilibrium_distance.astype(state.dtype)
 
     def begin(self, state: State) -> State:
         """The state with the list that its pairs reuse: its own where it serves, else a new one."""

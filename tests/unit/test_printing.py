@@ -60,6 +60,20 @@ def test_a_traced_value_shows_its_shape():
     assert "x float64[3, 4], traced m" in seen[1]
 
 
+def test_a_state_of_which_a_part_is_traced():
+    """Velocities alone may be what is differentiated: the speed is not read then."""
+    seen = []
+
+    def inside(v):
+        state = js.State.from_points(NET, NET.grid(0.1), v * jnp.ones((12, 2)))
+        seen.append(str(state))
+        return jnp.sum(state.velocity.x)
+
+    jax.grad(inside)(1.0)
+    assert "x 0 to 0.3 m" in seen[0]
+    assert "speed traced" in seen[0]
+
+
 def test_what_is_not_finite_is_counted():
     """A range would hide it."""
     broken = js.State(START.time, js.Vector((START.position.x.at[0, 0].set(jnp.nan), START.position.y)), START.velocity, START.layout)

@@ -123,7 +123,7 @@ def mesh(n: int = 11) -> Scene:
     rule = js.ImageStiffness(smooth(scene.image, SMOOTHING * scene.spacing), 1.0, 30.0, 0.0, radius=0, sampling=spline)
     points = np.concatenate([np.stack([np.ravel(a) for a in scene.rest], axis=1), np.zeros((n * n, 1))], axis=1)
     start = js.State.from_points(net, points)
-    at_start = net.flatten(rule.prepare(net, start.dtype).stiffness(net, start))
+    at_start = net.flatten(rule.bind(net, start.dtype).stiffness(net, start))
     mass = HEAVIER * net.incident_sum(net.split(at_start))
     forces = (
         js.Springs(net, rule, 0.0, axes=(0, 1)),

@@ -12,6 +12,7 @@ the points end from ours, in sigma; the pairs are those at the start. Draws rate
 
 from __future__ import annotations
 
+import dataclasses
 import statistics
 from collections.abc import Callable
 from typing import Any
@@ -54,24 +55,24 @@ def exact(points: np.ndarray) -> tuple[np.ndarray, int]:
     return forces, len(i)
 
 
-def begun(points: np.ndarray, speeds: np.ndarray) -> tuple[js.System, js.State]:
-    """The same fluid here, its list begun."""
+def begun(points: np.ndarray, speeds: np.ndarray) -> tuple[js.System, js.BoundSystem, js.State]:
+    """The same fluid here, also bound, its list begun."""
     net = js.Graph.from_edges(np.zeros((0, 2), int), len(points))
     fluid = js.Fluid(js.LennardJones(1.0, 1.0), js.ShiftedForce(REACH), js.NeighbourList(CAPACITY, SKIN))
-    system = js.System(net, mass=1.0, forces=fluid).prepare(jnp.float32)
-    return system, eqx.filter_jit(lambda s: system.begin(s))(js.State.from_points(net, points, speeds))
+    system = js.System(net, mass=1.0, forces=fluid)
+    return system, system.bind(jnp.float32), eqx.filter_jit(lambda s: system.begin(s))(js.State.from_points(net, points, speeds))
 
 
 def ours(points: np.ndarray, speeds: np.ndarray) -> fluid_peers.Peer:
     """Our own fluid, asked as the others are."""
-    system, state = begun(points, speeds)
-    force = jax.jit(lambda s: system.force(s))
+    system, bound, state = begun(points, speeds)
+    force = jax.jit(lambda s: bound.force(s))
 
     def steps(dt: float, n_steps: int) -> Callable[[], tuple[Any, int]]:
         def run() -> tuple[Any, int]:
             end = jax.block_until_ready(js.rollout(system, state, js.VelocityVerlet(), dt, n_steps))
             js.raise_for_status(end)
-            return end.state.points, int(end.state.neighbours.rebuilds)
+            return end.state.points, int(end.state.memory[0].value.rebuilds)
 
         return run
 
@@ -83,13 +84,13 @@ def ours(points: np.ndarray, speeds: np.ndarray) -> fluid_peers.Peer:
 
 def costs(points: np.ndarray, speeds: np.ndarray, rounds: int) -> dict[str, float]:
     """What a new list and a gradient cost, in forces of the same rounds."""
-    system, state = begun(points, speeds)
+    _, system, state = begun(points, speeds)
 
     def squared_forces(x: js.Vector) -> jax.Array:
         return jnp.sum(jnp.stack([jnp.sum(a * a) for a in system.force(state.moved(x, state.velocity))]))
 
     force, gradient = jax.jit(lambda s: system.force(s)), jax.jit(lambda s: jax.grad(squared_forces)(s.position))
-    begin = jax.jit(lambda s: system.begin(eqx.tree_at(lambda s: s.neighbours, s, None)))
+    begin = jax.jit(lambda s: system.begin(dataclasses.replace(s, memory=None)))
     runs = {"force": lambda: force(state), "list": lambda: begin(state), "gradient": lambda: gradient(state)}
     taken = seconds(runs, rounds)
     return {name: taken[name] / taken["force"] for name in ("list", "gradient")}

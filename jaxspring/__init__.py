@@ -14,7 +14,10 @@ _HOMES = {
     "vector": ("Vector",),
     "status": ("Flag", "SimulationError", "StabilityWarning", "Status", "raise_for_status"),
     "state": ("State",),
-    "system": ("Energy", "Motion", "System"),
+    "system": ("System",),
+    "bound": ("BoundSystem", "Energy"),
+    "nodes": ("Motion",),
+    "memory": ("Memory",),
     "masses": ("lumped_mass",),
     "edit": ("replace",),
     "resume": ("Resume",),
@@ -48,7 +51,7 @@ _HOMES = {
         "principal_curvatures",
     ),
     "images.files": ("Channel", "ImageError", "Luminance", "elevation_model", "image_from_array", "load_image"),
-    "forces.base": ("Finding", "Force"),
+    "forces.base": ("Finding", "Force", "Rule", "Scene", "Step"),
     "forces.linearisation": ("ExactTangent", "Linearisation", "Secant", "Tangent"),
     "forces.laws": ("EnergyLaw", "Hooke", "Law", "PowerLaw", "PullLaw", "TensionOnly"),
     "forces.springs": ("ExpansionRule", "Springs", "StiffnessRule"),
@@ -124,9 +127,11 @@ if TYPE_CHECKING:  # written by `python -m tests.face`
     from .status import Status as Status
     from .status import raise_for_status as raise_for_status
     from .state import State as State
-    from .system import Energy as Energy
-    from .system import Motion as Motion
     from .system import System as System
+    from .bound import BoundSystem as BoundSystem
+    from .bound import Energy as Energy
+    from .nodes import Motion as Motion
+    from .memory import Memory as Memory
     from .masses import lumped_mass as lumped_mass
     from .edit import replace as replace
     from .resume import Resume as Resume
@@ -185,6 +190,9 @@ if TYPE_CHECKING:  # written by `python -m tests.face`
     from .images.files import load_image as load_image
     from .forces.base import Finding as Finding
     from .forces.base import Force as Force
+    from .forces.base import Rule as Rule
+    from .forces.base import Scene as Scene
+    from .forces.base import Step as Step
     from .forces.linearisation import ExactTangent as ExactTangent
     from .forces.linearisation import Linearisation as Linearisation
     from .forces.linearisation import Secant as Secant

@@ -25,8 +25,10 @@ from jaxtyping import Array
 
 from ._arrays import Numbers, given
 from ._checks import as_inexact, finite, has_shape, is_concrete, shape_of
+from .bound import BoundSystem
 from .forces.linearisation import ExactTangent
 from .linalg.eigen import lowest_eigenpairs, symmetric_eigen
+from .nodes import Nodes
 from .numerics import is_traced
 from .state import State
 from .system import System
@@ -143,17 +145,18 @@ def frequency_response(system: System, state: State, frequencies: Numbers, force
 
 @eqx.filter_jit
 def _dense_modes(system: System, state: State, count: int) -> tuple[Modes, Array]:
-    system = system.prepare(state.dtype)
-    free, scale = _free(system, state), 1 / jnp.sqrt(_masses(system, state))
-    stiffness, _ = _linearised(system, state, with_damping=False)
+    bound = system.bind(state.dtype)
+    state = bound.own(state)
+    free, scale = _free(bound, state), 1 / jnp.sqrt(_masses(bound, state))
+    stiffness, _ = _linearised(bound, state, with_damping=False)
     largest = jnp.max(jnp.abs(stiffness))
     asymmetry = jnp.max(jnp.abs(jnp.where(free[:, None] & free[None, :], stiffness - stiffness.T, 0)))
     asymmetry = asymmetry / jnp.where(largest > 0, largest, jnp.ones_like(largest))
     a = scale[:, None] * (0.5 * (stiffness + stiffness.T)) * scale[None, :]
     a = jnp.where(free[:, None] & free[None, :], a, jnp.zeros_like(a))
     # Above all eigenvalues, and each alone: so held coordinates come last, and repeat no eigenvalue.
-    bound = lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(a), axis=1)))
-    apart = jnp.where(bound > 0, bound, jnp.ones_like(bound)) * jnp.linspace(2.0, 3.0, len(a), dtype=a.dtype)
+    highest = lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(a), axis=1)))
+    apart = jnp.where(highest > 0, highest, jnp.ones_like(highest)) * jnp.linspace(2.0, 3.0, len(a), dtype=a.dtype)
     a = a + jnp.diag(jnp.where(free, jnp.zeros_like(apart), apart))
     values, vectors = symmetric_eigen(jnp.where(asymmetry > _slack(state), jnp.full_like(a, jnp.nan), a))
     vectors = jnp.where(free[:, None], scale[:, None] * vectors, jnp.zeros_like(vectors)).T[:count]
@@ -170,17 +173,18 @@ def _on_the_host(system: System, state: State, n_modes: int | None) -> Modes:
             f"This system has more than {LARGEST_DENSE} unknowns (nodes times coordinates): too large for a dense matrix, and so for all "
             "modes and for derivatives. Pass n_modes, and call normal_modes outside jit, grad and vmap."
         )
-    system = system.prepare(state.dtype)
-    matrix = system.matrix(system.stiffness_blocks(state, ExactTangent()), state)
-    probe = system.hold(state.position.map(lambda a: jnp.asarray(np.random.default_rng(0).normal(size=a.shape), a.dtype)))
-    named = system.hold(matrix.blocks.product(probe))
-    missing = named + system.hold(jax.jvp(lambda x: system.force(_at_rest(state, x)), (state.position,), (probe,))[1])
+    bound = system.bind(state.dtype)
+    state = bound.own(state)
+    matrix = bound.matrix(bound.stiffness_blocks(state, ExactTangent()), state)
+    probe = bound.hold(state.position.map(lambda a: jnp.asarray(np.random.default_rng(0).normal(size=a.shape), a.dtype)))
+    named = bound.hold(matrix.blocks.product(probe))
+    missing = named + bound.hold(jax.jvp(lambda x: bound.force(_at_rest(state, x)), (state.position,), (probe,))[1])
     if bool(jnp.max(missing.norm()) > _slack(state) * jnp.max(named.norm())):
         raise ValueError(
             "The stiffness blocks that the forces name are not their dF/dx: a stiffness follows an image, data springs pull along z alone, "
             f"or a force of your own does not name them. Systems of up to {LARGEST_DENSE} unknowns need no blocks."
         )
-    free, scale = np.asarray(_free(system, state)), 1 / np.sqrt(np.asarray(_masses(system, state), np.float64))
+    free, scale = np.asarray(_free(bound, state)), 1 / np.sqrt(np.asarray(_masses(bound, state), np.float64))
     if n_modes >= free.sum():
         raise ValueError(f"n_modes = {n_modes}: of a system this large less than its {free.sum()} modes can be found.")
     a = matrix.to_scipy().astype(np.float64)[free][:, free].multiply(scale[free][:, None]).multiply(scale[free][None, :])
@@ -192,9 +196,10 @@ def _on_the_host(system: System, state: State, n_modes: int | None) -> Modes:
 
 @eqx.filter_jit
 def _responses(system: System, state: State, frequencies: Array, force: tuple[Array, Array]) -> Array:
-    system = system.prepare(state.dtype)
-    free, mass = _free(system, state), _masses(system, state)
-    stiffness, damping = _linearised(system, state, with_damping=True)
+    bound = system.bind(state.dtype)
+    state = bound.own(state)
+    free, mass = _free(bound, state), _masses(bound, state)
+    stiffness, damping = _linearised(bound, state, with_damping=True)
     both = free[:, None] & free[None, :]
     unit = jnp.eye(len(free), dtype=state.dtype)
     load = lax.complex(*(jnp.where(free, part.ravel(), jnp.zeros_like(part.ravel())) for part in force))
@@ -206,7 +211,7 @@ def _responses(system: System, state: State, frequencies: Array, force: tuple[Ar
     return lax.map(solve, frequencies).reshape(len(frequencies), len(free) // state.dim, state.dim)
 
 
-def _linearised(system: System, state: State, *, with_damping: bool) -> tuple[Array, Array]:
+def _linearised(system: BoundSystem, state: State, *, with_damping: bool) -> tuple[Array, Array]:
     """(N D, N D) matrices K and G in the user's order; G is zero where it is not wanted."""
     layout, dim = state.layout, state.dim
     zero = jnp.zeros((int(np.prod(state.position.shape)), dim), state.dtype)
@@ -230,21 +235,21 @@ def _at_rest(state: State, position: Vector) -> State:
     return state.moved(position, Vector.zeros_like(position))
 
 
-def _count_free(system: System, state: State) -> int:
+def _count_free(system: Nodes, state: State) -> int:
     """How many coordinates are free; all of them where that is not known."""
     masks, shape = system.free_masks(state.dim), shape_of(state.position[0])
     known = (np.broadcast_to(m, shape) if m is not None and is_concrete(m) else np.ones(shape, bool) for m in masks)
     return sum(int(m.sum()) for m in known)
 
 
-def _free(system: System, state: State) -> Array:
+def _free(system: Nodes, state: State) -> Array:
     """(N D,) booleans in the user's order."""
     shape = shape_of(state.position[0])
     masks = (jnp.ones(shape, bool) if m is None else jnp.broadcast_to(m, shape) for m in system.free_masks(state.dim))
     return jnp.stack([state.layout.flatten(m) for m in masks], axis=-1).ravel()
 
 
-def _masses(system: System, state: State) -> Array:
+def _masses(system: Nodes, state: State) -> Array:
     """(N D,) masses in the user's order [kg]."""
     mass = state.layout.flatten(jnp.broadcast_to(system.mass.astype(state.dtype), state.position.shape))
     return jnp.repeat(mass, state.dim)

@@ -20,8 +20,9 @@ from jaxtyping import Array
 
 from ._arrays import Numbers, given
 from ._checks import as_inexact, finite, has_shape, is_concrete
+from .bound import BoundSystem
 from .events import on_states
-from .forces.fluid import Fluid
+from .forces.base import acts, remembers
 from .numerics import linear_call
 from .state import State
 from .status import Flag, Status
@@ -182,9 +183,9 @@ def _solve(
 ) -> OdeResult:
     import diffrax
 
-    ready = system.prepare(state.dtype)
-    # A list of neighbours is kept up to date by rollout alone: without one each evaluation makes its own.
-    start = ready.constrain(dataclasses.replace(state, neighbours=None))
+    ready = system.bind(state.dtype)
+    # A cache is kept up to date by rollout alone: without it each evaluation makes its own.
+    start = ready.alone(state)
     first = Carry(start, None, jnp.zeros((), jnp.int32))
     before = begin(system, ready, Precision.of(ready, start), first, jnp.zeros((), state.dtype), None)
     end = diffrax.SubSaveAt(t1=True)
@@ -251,7 +252,7 @@ def _refuse_reverse(_: Any, cotangent: Any) -> Any:
 class _Scene(eqx.Module):
     """The system, and a state that holds all that does not move."""
 
-    system: System
+    system: BoundSystem
     like: State
 
 
@@ -273,7 +274,7 @@ def _kick(time: Any, position: Any, scene: Any) -> Any:
     return _flow(time, (position, Vector.zeros_like(position)), scene)[1]
 
 
-def _terms(system: System, state: State, solver: Any) -> Any:
+def _terms(system: BoundSystem, state: State, solver: Any) -> Any:
     """The right-hand side in the form that the solver wants."""
     import diffrax
 
@@ -294,7 +295,7 @@ def _terms(system: System, state: State, solver: Any) -> Any:
     return diffrax.ODETerm(_flow)
 
 
-def _reads_velocity(system: System, state: State) -> bool:
+def _reads_velocity(system: BoundSystem, state: State) -> bool:
     """Whether the program of the acceleration reads the velocity at all."""
 
     def acceleration(velocity: Vector) -> Vector:
@@ -336,8 +337,8 @@ def _verdict(result: Any, n_steps: Array) -> Status:
 
 
 def _check_parts(system: System) -> None:
-    """ValueError naming what acts after steps. A fluid's list of neighbours changes no result; anything else would be left out."""
-    rules = [type(part).__name__ for _, part in system.followers if not isinstance(part, Fluid)]
+    """ValueError naming what acts after steps, or remembers. A cache changes no result; anything else would be left out."""
+    rules = [type(part).__name__ for part in system.parts if not part.is_cache and (acts(part) or remembers(part))]
     if rules:
         raise ValueError(
             f"{', '.join(rules)}: this acts after steps of fixed length, which an adaptive solver does not take. Use rollout, or leave it "

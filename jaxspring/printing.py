@@ -45,7 +45,7 @@ def effect(thing: Any) -> str:
     words = [] if net is None else [f"{net.n_springs} springs"]
     for field in dataclasses.fields(thing):
         said = _said(getattr(thing, field.name), net)
-        if said and field.name != "net":
+        if said and field.name not in ("net", "place"):
             words.append(f"{field.name} {said}")
     return f"{type(thing).__name__}: {', '.join(words)}" if words else type(thing).__name__
 
@@ -92,9 +92,8 @@ def state(thing: Any) -> str:
         value = getattr(thing, name)
         if value is not None:
             lines.append(f"{name} {numbers(value)}{unit}")
-    for name in ("alive", "rest_length", "neighbours", "ledger"):
-        if getattr(thing, name) is not None:
-            lines.append(f"with {name}")
+    lines += [f"with {name}" for name in ("alive", "rest_length") if getattr(thing, name) is not None]
+    lines += [f"with the memory of {entry.owner.kind}" for entry in thing.memory or () if entry is not None]
     return under(head, lines)
 
 

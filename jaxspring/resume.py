@@ -20,6 +20,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from .bound import BoundSystem
 from .facts import Fact, digest, facts
 from .numerics import stopped
 from .state import State
@@ -108,13 +109,13 @@ def check_kind(resume: Any) -> None:
         )
 
 
-def taken_up(resume: Resume, system: System, ready: System, state: State, start: State, stepper: Stepper, dt: Array) -> Resume:
+def taken_up(resume: Resume, system: System, ready: BoundSystem, state: State, start: State, stepper: Stepper, dt: Array) -> Resume:
     """The resume as it fits this run: memory and time as they were, or anew.
 
     Args:
         resume: of the earlier run.
         system: as the user gave it.
-        ready: the same prepared.
+        ready: the same bound.
         state: as the user gave it.
         start: the same as the run begins.
         stepper: how the run steps.
@@ -154,7 +155,7 @@ def checksum(tree: Any) -> Array:
     return total
 
 
-def _memory(resume: Resume, is_same: Array, stepper: Stepper, ready: System, start: State) -> Any:
+def _memory(resume: Resume, is_same: Array, stepper: Stepper, ready: BoundSystem, start: State) -> Any:
     """The stepper's memory as it was where nothing changed, else made anew."""
     fresh = eqx.filter_eval_shape(stepper.init, ready, start)
     if _kind(fresh) != _kind(resume.memory):

@@ -25,6 +25,7 @@ from . import printing
 from ._arrays import Numbers
 from ._checks import as_inexact, finite, has_shape, is_concrete
 from .blocks import Adjoint, Checkpointed, Plan, make_plan, run_blocks
+from .bound import BoundSystem
 from .facts import of_functions
 from .linalg.base import SolveInfo
 from .numerics import is_traced, stopped
@@ -179,10 +180,9 @@ def _warn(result: Result, dt: Array) -> None:
 
 
 class _Begun(eqx.Module):
-    """What is made once, before the first step: constants as the loop wants them, the memory of the stepper, what is wrong already.
+    """What is made once, before the first step: where the steps start, the memory of the stepper, what is wrong already.
 
     Attributes:
-        ready: the prepared system.
         state: where the steps start.
         resume: with the stepper's memory.
         limit: largest stable dt [s], or None.
@@ -191,7 +191,6 @@ class _Begun(eqx.Module):
         is_fresh: whether no earlier run goes on here (static): steps are then counted from zero.
     """
 
-    ready: System
     state: State
     resume: Resume
     limit: Array | None
@@ -204,8 +203,7 @@ class _Begun(eqx.Module):
         return eqx.tree_at(lambda b: (b.state, b.resume, b.status), self, (result.state, result.resume, Status.ok()))
 
 
-def _begin(system: System, state: State, resume: Resume | None, job: _Job) -> _Begun:
-    ready = system.prepare(state.dtype)
+def _begin(system: System, ready: BoundSystem, state: State, resume: Resume | None, job: _Job) -> _Begun:
     start = ready.begin(state)
     still, still_start = stopped((ready, start))
     limit = dt_limit(still, still_start, job.stepper)
@@ -217,10 +215,10 @@ def _begin(system: System, state: State, resume: Resume | None, job: _Job) -> _B
     status = begin(system, ready, precise, Carry(start, taken.memory, taken.step), job.dt, limit)
     if not job.stepper.runs_backward:
         status = status.then(Status.when(Flag.INVALID, stopped(job.dt) < 0, step=taken.step))
-    return _Begun(ready, start, taken, limit, status, precise, resume is None)
+    return _Begun(start, taken, limit, status, precise, resume is None)
 
 
-def _fresh(system: System, ready: System, state: State, start: State, job: _Job) -> Resume:
+def _fresh(system: System, ready: BoundSystem, state: State, start: State, job: _Job) -> Resume:
     """Where nothing goes on."""
     zero = jnp.zeros((), jnp.int32)
     memory, origin = job.stepper.init(ready, start), Origin.of(system, state, job.stepper)
@@ -228,9 +226,9 @@ def _fresh(system: System, ready: System, state: State, start: State, job: _Job)
     return Resume(state.time, zero, zero, state.time, job.dt, memory, constants, jnp.zeros((), jnp.uint32), origin)
 
 
-def _proceed(begun: _Begun, job: _Job, progress: Progress | None = None) -> Result:
+def _proceed(ready: BoundSystem, begun: _Begun, job: _Job, progress: Progress | None = None) -> Result:
     """The steps, and how they ended."""
-    ready, resume, limit = begun.ready, begun.resume, begun.limit
+    resume, limit = begun.resume, begun.limit
     still, info = stopped(ready), job.stepper.report(resume.memory)
     if job.keep_solves and (info is None or job.plan.save_every is None):
         raise ValueError("keep_solves keeps how an implicit stepper's solves ended in each frame: pass save_every and an implicit stepper.")
@@ -281,7 +279,8 @@ class _Clock(eqx.Module):
 
 def _run(system: System, state: State, resume: Resume | None, job: _Job, progress: Progress | None = None) -> Result:
     """The whole run as one traced program."""
-    return _proceed(_begin(system, state, resume, job), job, progress)
+    ready = system.bind(state.dtype)
+    return _proceed(ready, _begin(system, ready, state, resume, job), job, progress)
 
 
 def _in_user_order(status: Status, state: State) -> Status:
@@ -293,7 +292,7 @@ def _in_user_order(status: Status, state: State) -> Status:
     return eqx.tree_at(lambda s: s.node, status, jnp.where(status.node >= 0, named, status.node))
 
 
-def _advance(system: System, stepper: Stepper, clock: _Clock, carry: Carry) -> Carry:
+def _advance(system: BoundSystem, stepper: Stepper, clock: _Clock, carry: Carry) -> Carry:
     index, dt = carry.step + 1, clock.dt
     state, memory = stepper.step(system, carry.state, dt, carry.memory)
     state = eqx.tree_at(lambda s: s.time, state, clock.at(index))
@@ -312,8 +311,8 @@ def _advance(system: System, stepper: Stepper, clock: _Clock, carry: Carry) -> C
 
 
 _compiled = eqx.filter_jit(_run)
-_compiled_begin = eqx.filter_jit(_begin)
-_compiled_proceed = eqx.filter_jit(_proceed)
+_compiled_begin = eqx.filter_jit(lambda system, state, *rest: _begin(system, system.bind(state.dtype), state, *rest))
+_compiled_proceed = eqx.filter_jit(lambda system, begun, job: _proceed(system.bind(begun.state.dtype), begun, job))
 
 
 def _run_eagerly(system: System, state: State, resume: Resume | None, job: _Job, progress: Progress | None) -> Result:
@@ -332,9 +331,9 @@ def _run_eagerly(system: System, state: State, resume: Resume | None, job: _Job,
         for piece in pieces:
             before, frames, done = so_far
             at, part = begun if before is None else begun.at(before), replace(job, plan=piece)
-            latest = _compiled_proceed(at, part)
+            latest = _compiled_proceed(system, at, part)
             if _is_unnamed(latest) and (before is None or not before.status.has(Flag.NONFINITE)):
-                latest = _compiled_proceed(at, replace(part, replays=True))
+                latest = _compiled_proceed(system, at, replace(part, replays=True))
             if len(pieces) > 1 or progress is not None:
                 jax.block_until_ready(latest)
             frame = (latest.saved, latest.info.solves_saved)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -13,8 +12,9 @@ from jaxtyping import Array
 from . import printing
 from ._arrays import Numbers, kept
 from ._checks import as_inexact, finite, has_shape
+from .memory import Memories
 from .topology.base import NodeLayout, Topology
-from .topology.edge_field import EdgeField
+from .topology.edge_field import EdgeField, OfNets, field_of, with_field
 from .vector import Vector
 
 
@@ -28,10 +28,11 @@ class State(eqx.Module):
         layout: how node fields are stored (static).
         temperature: node shape [K], or None where the scene has no heat.
         enthalpy: heat that melting has taken up, of each node [J], or None without latent heat.
-        alive: bool edge field of the system's net, False where a spring has broken; None where springs do not break.
-        rest_length: edge field [m] of rest lengths that have changed for good, or None.
-        neighbours: the list that short-ranged pair forces reuse, or None.
-        ledger: what the energy went into so far, or None where nobody asked.
+        alive: bool edge field, False where a spring has broken; a tuple of such fields where the springs of several nets break; None where
+            none does. `alive_of(net)` is that of one net.
+        rest_length: edge field [m] of rest lengths that have changed for good, or a tuple of several nets', or None.
+        memory: what single effects remember, an entry for each part of the system that made the state (`Memory`); None where no part
+            remembers anything.
 
     What is None is not there: it costs nothing, and its effect is not in the scene.
     """
@@ -42,10 +43,9 @@ class State(eqx.Module):
     layout: NodeLayout = eqx.field(static=True)
     temperature: Array | None = eqx.field(converter=kept, default=None)
     enthalpy: Array | None = eqx.field(converter=kept, default=None)
-    alive: EdgeField | None = None
-    rest_length: EdgeField | None = None
-    neighbours: Any = None
-    ledger: Any = None
+    alive: OfNets = None
+    rest_length: OfNets = None
+    memory: Memories = None
 
     def __str__(self) -> str:
         """A few lines for a person."""
@@ -89,6 +89,22 @@ class State(eqx.Module):
         """The state at another place, velocity and (where given) time, all else as it is."""
         time = self.time if time is None else time
         return dataclasses.replace(self, time=time, position=position, velocity=velocity)
+
+    def alive_of(self, net: Topology) -> EdgeField | None:
+        """Which springs of this net hold, or None where none of them breaks."""
+        return field_of(net, self.alive)
+
+    def rest_length_of(self, net: Topology) -> EdgeField | None:
+        """Rest lengths of this net's springs that have changed for good [m], or None."""
+        return field_of(net, self.rest_length)
+
+    def with_alive(self, net: Topology, alive: EdgeField) -> State:
+        """The state where these springs of this net hold."""
+        return dataclasses.replace(self, alive=with_field(net, self.alive, net.own(alive.families)))
+
+    def with_rest_length(self, net: Topology, rest_length: EdgeField) -> State:
+        """The state where this net's springs have these rest lengths [m]."""
+        return dataclasses.replace(self, rest_length=with_field(net, self.rest_length, net.own(rest_length.families)))
 
     def checked(self) -> State:
         """The state itself, where a system can take it. Whatever takes a state asks here.

@@ -18,6 +18,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from .bound import BoundSystem
 from .forces.base import SPOILT
 from .linalg.base import SolveInfo
 from .numerics import any_lane, cast_inexact, stopped
@@ -83,11 +84,11 @@ class Precision(eqx.Module):
     size: Array
 
     @staticmethod
-    def of(ready: System, state: State) -> Precision:
+    def of(ready: BoundSystem, state: State) -> Precision:
         """At the start of a run."""
         return stopped(Precision(tuple(force.rounding(state) for force in ready.forces), state.position.largest()))
 
-    def look(self, ready: System, carry: Carry, status: Status) -> Status:
+    def look(self, ready: BoundSystem, carry: Carry, status: Status) -> Status:
         """The status, with PRECISION where coordinates have grown too large for a force.
 
         Springs are measured only where the coordinates have grown, and come within a tenth of what the lengths at the start allow; no more
@@ -107,10 +108,10 @@ class Precision(eqx.Module):
         return status
 
 
-def begin(system: System, ready: System, precise: Precision, carry: Carry, dt: Array, limit: Array | None) -> Status:
+def begin(system: System, ready: BoundSystem, precise: Precision, carry: Carry, dt: Array, limit: Array | None) -> Status:
     """Before the first step: constants that a constructor would refuse, a state that is not finite, a dt above the limit, and
-    coordinates too large for the springs between them. The constants are read as the user gave them, which is one array where the prepared
-    system (`ready`) holds one for every spring family.
+    coordinates too large for the springs between them. The constants are read as the user gave them, which is one array where the bound one
+    (`ready`) holds one for every spring family.
     """
     if jax.dtypes.canonicalize_dtype(np.float64) != np.float64:
         system = cast_inexact(system, carry.state.dtype)  # constants of float64, made before x64 was switched off
@@ -136,12 +137,12 @@ def begin(system: System, ready: System, precise: Precision, carry: Carry, dt: A
     return lax.stop_gradient(status)
 
 
-def inspect(system: System, precise: Precision, start: State, after: Carry, status: Status) -> Status:
+def inspect(system: BoundSystem, precise: Precision, start: State, after: Carry, status: Status) -> Status:
     """The status brought up to date at the end of a block of a run from `start`."""
     return precise.look(system, after, status.then(look(system, after, start)))
 
 
-def look(system: System, carry: Carry, start: State | None = None) -> Status:
+def look(system: BoundSystem, carry: Carry, start: State | None = None) -> Status:
     """Status of one state: is it finite, and what the effects have to report, also since `start`."""
     system, state, start = stopped((system, carry.state, start))
     bad = _nonfinite(state)
@@ -154,7 +155,7 @@ def look(system: System, carry: Carry, start: State | None = None) -> Status:
     return status
 
 
-def settle(advance: Callable[[Carry], Carry], first: Carry, status: Status, system: System) -> Status:
+def settle(advance: Callable[[Carry], Carry], first: Carry, status: Status, system: BoundSystem) -> Status:
     """The final status: a run that failed is replayed from `first` to name the step, the node and the effect."""
     known = (status.step, status.node, status.effect)
 
@@ -174,7 +175,7 @@ def settle(advance: Callable[[Carry], Carry], first: Carry, status: Status, syst
     return lax.stop_gradient(Status(status.flags, step, node, effect, status.count))
 
 
-def _has_failed(system: System, state: State) -> Array:
+def _has_failed(system: BoundSystem, state: State) -> Array:
     """Whether a state is not finite, or a force says so of what it makes of the state."""
     failed = jnp.any(_nonfinite(state))
     for effect in system.parts:
@@ -184,7 +185,7 @@ def _has_failed(system: System, state: State) -> Array:
     return failed
 
 
-def _blame(system: System, state: State, failed: State) -> Array:
+def _blame(system: BoundSystem, state: State, failed: State) -> Array:
     """Index of the first force that is not finite in this state; else, where only temperatures failed in the next, of the first rule
     that sets them; else -1.
     """

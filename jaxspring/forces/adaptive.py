@@ -96,7 +96,11 @@ class ImageStiffness(StiffnessRule):
         """The adaptation function a_d, an image with values in [0, 1]."""
         return adaptation(self.image, self.sigma, self.observation, radius=self.radius)
 
-    def prepare(self, net: Topology, dtype: Any) -> ImageStiffness:
+    def follows(self) -> dict[str, tuple[str, ...]]:
+        """Which fields are made anew where another is replaced by a number: the filter's width follows sigma."""
+        return {"sigma": ("radius",)}
+
+    def bind(self, net: Topology, dtype: Any) -> ImageStiffness:
         """The rule with its adaptation function made: once before a loop, not in every step."""
         ready = self.adaptation().surface(self.sampling) if self.adapted is None else self.adapted
         return cast_inexact(eqx.tree_at(lambda r: r.adapted, self, ready, is_leaf=lambda leaf: leaf is None), dtype)

@@ -9,8 +9,9 @@ Write your own by subclassing `Force`: `force` alone is enough. `energy` closes 
 from __future__ import annotations
 
 import abc
+import dataclasses
 from collections.abc import Callable
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax
@@ -19,9 +20,12 @@ from jaxtyping import Array
 
 from .. import printing
 from ..linalg.operators import Blocks
+from ..memory import Memory, Owner, entry_at, with_entry
 from ..numerics import cast_inexact
 from ..state import State
 from ..status import Flag, Status
+from ..topology.base import Topology
+from ..topology.periods import box_of
 from ..vector import Vector
 from .linearisation import Linearisation
 
@@ -53,6 +57,8 @@ class Step(eqx.Module):
         free: per coordinate, where nodes are free (None: all are). None where no obstacle asks.
         by_velocity: (velocities) -> accelerations [m/s^2] by the forces that depend on velocity, where motion ended; None where no force
             does, or no obstacle asks.
+        stages: what the rules before this one left, in their order: (place, state), all obstacles together as one of place -1.
+        impacts: what each obstacle did, for a rule that watches, or None.
     """
 
     before: State
@@ -60,32 +66,97 @@ class Step(eqx.Module):
     dt: Array
     free: tuple[Array | None, ...] | None = None
     by_velocity: Callable[[Vector], Vector] | None = None
+    stages: tuple[tuple[int, State], ...] = ()
+    impacts: Any = None
+
+
+class Scene:
+    """What a part is told of its system when it is bound.
+
+    Attributes:
+        net: of the system.
+        mass: node masses [kg], one number or a node array.
+        dtype: of the state.
+        forces: of the system, not bound.
+        rules: of the system, not bound.
+    """
+
+    def __init__(self, net: Topology, mass: Array, dtype: Any, forces: tuple[Force, ...], rules: tuple[Rule, ...]):
+        self.net, self.mass, self.dtype, self.forces, self.rules = net, mass, dtype, forces, rules
+        self._bound: dict[int, Any] = {}
+
+    @property
+    def box(self) -> Array | None:
+        """(D,) periods of the coordinates [m], or None."""
+        return box_of(self.net)
+
+    def bound(self, place: int) -> Any:
+        """The part at this place, bound; each is bound once, and the others hold no copy of it."""
+        if place not in self._bound:
+            part = (*self.forces, *self.rules)[place]
+            part.check(self)
+            self._bound[place] = _placed(part.bind(self), place)
+        return self._bound[place]
 
 
 class Rule(eqx.Module):
     """What happens to a state after each step, besides motion. Abstract.
 
-    Rules run in the order in which the system names them, each on the state that the one before left; obstacles come last, together. A
-    rule that gives the state another position or velocity tells the stepper so by that alone.
+    Rules run in the order in which the system names them, each on the state that the one before left; then all obstacles, together; then
+    those that watch. A rule that gives the state another position or velocity tells the stepper so by that alone.
+
+    What it must know from step to step it gives in `remember`, reads by `recall` and writes by `keep`.
+
+    Attributes:
+        is_obstacle: whether nodes meet it: all of a system's act together, the earliest impact first (class attribute).
+        is_cache: whether what it remembers can be made anew from the state (class attribute).
+        sets_temperature: whether it changes temperatures: it is named where one is NaN or infinite (class attribute).
+        watches: whether it acts last, and is told by `Step.stages` what all the others did (class attribute).
+        place: which part of its system it is, once bound: its index in a status and in `state.memory` (static).
     """
+
+    is_obstacle: ClassVar[bool] = False
+    is_cache: ClassVar[bool] = False
+    sets_temperature: ClassVar[bool] = False
+    watches: ClassVar[bool] = False
+    place: int | None = eqx.field(static=True, init=False, default=None)
 
     def __str__(self) -> str:
         """A line for a person."""
         return printing.effect(self)
 
-    @property
-    def obstacles(self) -> tuple[Rule, ...]:
-        """The obstacles that it holds, itself where it is one. All of a system's act together, the earliest impact first."""
-        return ()
+    def check(self, scene: Scene) -> None:
+        """Raise ValueError where it does not fit the system. Called when the system is made, and when it is bound."""
 
-    @property
-    def sets_temperature(self) -> bool:
-        """Whether it changes temperatures: it is named where one is NaN or infinite."""
-        return False
+    def bind(self, scene: Scene) -> Self:
+        """The same as the loop wants it: every constant in the shape and dtype of the state, with what it needs of the scene. Called once,
+        before the loop. It may take `scene.mass` and, by `scene.bound(i)`, other parts.
+        """
+        return cast_inexact(self, scene.dtype)
 
     def begin(self, state: State) -> State:
-        """The state with the memory that this rule needs, made where it is not there yet. Called before the first step."""
+        """The state with what this rule needs of the fields that all effects share. Called before the first step."""
         return state
+
+    def remember(self, state: State) -> Any:
+        """What it remembers at the start of a run, any tree of arrays; None: nothing. Its shapes must not change later."""
+        return None
+
+    def renew(self, memory: Any, state: State) -> Any:
+        """The memory of an earlier run as one that goes on from `state` may use it."""
+        return memory
+
+    def recall(self, state: State) -> Any:
+        """What it remembers in this state; what `remember` gives where that is nothing yet."""
+        entry = entry_at(state.memory, self.place)
+        return self.remember(state) if entry is None else entry.value
+
+    def keep(self, state: State, memory: Any) -> State:
+        """The state in which it remembers this. Only a bound part has a place there."""
+        if self.place is None:
+            raise ValueError(f"{type(self).__name__} has no place in a state's memory yet. Ask the parts of system.bind(state.dtype).")
+        entry = Memory(memory, Owner.of(self), self.is_cache)
+        return dataclasses.replace(state, memory=with_entry(state.memory, self.place, entry))
 
     def update(self, step: Step, state: State) -> tuple[State, Status]:
         """The state after this rule, where `state` is what motion and the rules before it left, and what went wrong."""
@@ -94,24 +165,6 @@ class Rule(eqx.Module):
     def limit(self, state: State) -> Array | None:
         """Largest stable dt [s]; None where nothing limits it."""
         return None
-
-    def prepare(self, dtype: Any) -> Self:
-        """The same with every constant in the shape and dtype that the loop wants. Called once, before the loop."""
-        return cast_inexact(self, dtype)
-
-    def with_mass(self, mass: Array) -> Self:
-        """The same, knowing the node masses [kg]; only what needs them answers with another object."""
-        return self
-
-    def with_box(self, box: Array | None) -> Self:
-        """The same, knowing the periods [m] of the system's coordinates (None: there are none), which it must fit; only what takes
-        differences without a net needs them.
-        """
-        return self
-
-    def with_forces(self, forces: tuple[Force, ...]) -> Self:
-        """The same, knowing all forces of its system; only what needs them answers with another object."""
-        return self
 
     def diagnose(self, state: State) -> tuple[Finding, ...]:
         """What this effect has to report about a state: see `Finding`."""
@@ -129,7 +182,7 @@ class Rule(eqx.Module):
 class Force(Rule):
     """A force on the nodes. Abstract; `Springs`, `Drag`, `Gravity` and the others are final.
 
-    A force may act as a rule, too: one that keeps a list up to date gives `begin` and `update`, and says so in `is_rule`.
+    A force may act as a rule, too: one that remembers something gives `remember` and `update`.
     """
 
     @abc.abstractmethod
@@ -137,9 +190,19 @@ class Force(Rule):
         """Force on each node [N], in node shape."""
 
     @property
-    def is_rule(self) -> bool:
-        """Whether `begin` and `update` are to be called."""
-        return False
+    def has_potential(self) -> bool:
+        """Whether it is the gradient of an `energy`: one that gives an `energy` is, unless it says no."""
+        return type(self).energy is not Force.energy
+
+    @property
+    def is_symmetric(self) -> bool:
+        """Whether -dF/dx and -dF/dv are symmetric, so that conjugate gradients apply: a force with a potential is."""
+        return self.has_potential
+
+    @property
+    def can_feed(self) -> bool:
+        """Whether it can raise the sum of kinetic and potential energy; one without a potential can, unless it says no."""
+        return not self.has_potential
 
     def energy(self, state: State) -> Array | None:
         """Potential energy [J], or None where the force has no potential."""
@@ -159,14 +222,6 @@ class Force(Rule):
         """
         return self.energy(state)
 
-    def is_symmetric(self, state: State) -> bool:
-        """Whether -dF/dx and -dF/dv are symmetric, so that conjugate gradients apply: a force with a potential is."""
-        return self.energy(state) is not None
-
-    def can_feed(self, state: State) -> bool:
-        """Whether the force can raise the sum of kinetic and potential energy; one without a potential can, unless it says no."""
-        return self.energy(state) is None
-
     def stiffness_bound(self, state: State) -> Array | None:
         """Upper bound of the row sums of |dF/dx| at each node [N/m], in node shape or a number; None where zero."""
         return None
@@ -182,6 +237,40 @@ class Force(Rule):
     def rounding(self, state: State) -> Array | None:
         """Rounding error of a position, relative to the smallest length that the effect must resolve; None where it takes no difference."""
         return None
+
+
+def check_class(part: Rule) -> None:
+    """TypeError where a class of a user's own has a field in the place of a method, or a method in the place of a property: what a force
+    says of itself must be a bool, else every condition on it would hold.
+    """
+    kind = Force if isinstance(part, Force) else Rule
+    for field in dataclasses.fields(part):
+        if field.name != "place" and callable(getattr(kind, field.name, None)):
+            raise TypeError(
+                f"{type(part).__name__} has a field {field.name}, but {kind.__name__}.{field.name} is a method. Rename the field."
+            )
+    for name in ("has_potential", "is_symmetric", "can_feed") if isinstance(part, Force) else ():
+        if not isinstance(getattr(part, name), bool):
+            raise TypeError(
+                f"{type(part).__name__}.{name} is a {type(getattr(part, name)).__name__}; expected a bool: make it a @property."
+            )
+
+
+def _placed(part: Any, place: int) -> Any:
+    """The part, knowing its place: a copy, since a part never changes."""
+    copy = jax.tree.map(lambda leaf: leaf, part)
+    object.__setattr__(copy, "place", place)
+    return copy
+
+
+def acts(part: Rule) -> bool:
+    """Whether it does something after a step."""
+    return type(part).update is not Rule.update
+
+
+def remembers(part: Rule) -> bool:
+    """Whether it may remember something."""
+    return type(part).remember is not Rule.remember
 
 
 def any_refused(*values: Any) -> Array:

@@ -8,7 +8,7 @@ The step is split where a node meets a plane: see `impacts.py`, which holds the 
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -50,6 +50,7 @@ class Floor(Rule):
     [0.  8.7]
     """
 
+    is_obstacle: ClassVar[bool] = True
     point: Array
     normal: Array
     friction: Array
@@ -63,11 +64,6 @@ class Floor(Rule):
             nonnegative(name, value, "It would feed energy in.")
         if is_concrete(self.restitution) and np.asarray(self.restitution) > 1:
             raise ValueError(f"restitution = {self.restitution} throws nodes back faster than they came. Pass 0 to 1.")
-
-    @property
-    def obstacles(self) -> tuple[Rule, ...]:
-        """Itself."""
-        return (self,)
 
     def height(self, state: State) -> Array:
         """(x - p) . n of each node [m], in node shape."""

@@ -24,7 +24,7 @@ from ..status import Flag
 from ..topology.base import Topology
 from ..topology.edge_field import EdgeField, SpringNumbers
 from ..vector import Vector
-from .base import Finding, Force, any_refused
+from .base import Finding, Force, Scene, any_refused
 from .in_box import long_springs, turned_springs
 from .laws import has_no_direction
 from .lengths import beyond_range
@@ -60,12 +60,14 @@ class Drag(Force):
         """Dt gamma v^2 / 2, summed [J]."""
         return jnp.sum(0.5 * dt * self._gamma(state).astype(state.dtype) * state.velocity.dot(state.velocity))
 
-    def is_symmetric(self, state: State) -> bool:
-        """Yes: it acts on each coordinate alone."""
+    @property
+    def is_symmetric(self) -> bool:
+        """Always: drag acts on each coordinate alone."""
         return True
 
-    def can_feed(self, state: State) -> bool:
-        """No: drag takes energy out."""
+    @property
+    def can_feed(self) -> bool:
+        """Never: drag takes energy out."""
         return False
 
     def damping_bound(self, state: State) -> Array:
@@ -102,9 +104,9 @@ class Dashpots(Force):
         self.damping = _edge_constant(net, "damping", damping)
         _check_sign("damping", self.damping, "A negative damper feeds energy in.")
 
-    def prepare(self, dtype: Any) -> Dashpots:
-        """Constants as edge fields of `dtype`."""
-        return cast_inexact(eqx.tree_at(lambda f: f.damping, self, self.net.edge_field(self.damping)), dtype)
+    def bind(self, scene: Scene) -> Dashpots:
+        """Constants as edge fields."""
+        return cast_inexact(eqx.tree_at(lambda f: f.damping, self, self.net.edge_field(self.damping)), scene.dtype)
 
     def force(self, state: State) -> Vector:
         """Sum of the dampers' pulls at each node [N]; a spring of no length has no direction and no damping."""
@@ -151,8 +153,9 @@ class Dashpots(Force):
             return ()
         return turned_springs(self.net, start.position, state.position, living(self.net, state))
 
-    def can_feed(self, state: State) -> bool:
-        """No: a damper takes energy out."""
+    @property
+    def can_feed(self) -> bool:
+        """Never: a damper takes energy out."""
         return False
 
     def damping_bound(self, state: State) -> Array | None:

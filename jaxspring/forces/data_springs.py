@@ -26,7 +26,7 @@ from ..numerics import cast_inexact
 from ..state import State
 from ..status import Flag
 from ..vector import Vector
-from .base import Finding, Force, any_not_positive, any_refused
+from .base import Finding, Force, Scene, any_not_positive, any_refused
 from .linearisation import Linearisation
 
 
@@ -52,9 +52,14 @@ class DataSprings(Force):
         self.conservative = conservative
         nonnegative("stiffness", self.stiffness, "A negative data spring pushes away from the image.")
 
-    def prepare(self, dtype: Any) -> DataSprings:
-        """The image ready to be read, constants of `dtype`."""
-        return _prepared(self, dtype)
+    def bind(self, scene: Scene) -> DataSprings:
+        """The image ready to be read."""
+        return _ready(self, scene.dtype)
+
+    @property
+    def has_potential(self) -> bool:
+        """Whether it is conservative."""
+        return self.conservative
 
     def force(self, state: State) -> Vector:
         """Pull toward the image [N]."""
@@ -129,9 +134,9 @@ class ImageAttraction(Force):
         finite("strength", self.strength)
         self.sampling = Bilinear() if sampling is None else sampling
 
-    def prepare(self, dtype: Any) -> ImageAttraction:
-        """The image ready to be read, constants of `dtype`."""
-        return _prepared(self, dtype)
+    def bind(self, scene: Scene) -> ImageAttraction:
+        """The image ready to be read."""
+        return _ready(self, scene.dtype)
 
     def force(self, state: State) -> Vector:
         """Strength grad d [N]; no force along z."""
@@ -160,7 +165,7 @@ def _surface(effect: DataSprings | ImageAttraction) -> Surface:
     return effect.image.surface(effect.sampling) if isinstance(effect.image, Image) else effect.image
 
 
-def _prepared(effect: Any, dtype: Any) -> Any:
+def _ready(effect: Any, dtype: Any) -> Any:
     """The effect with its image ready to be read: a spline is filtered once, not in every step."""
     return cast_inexact(eqx.tree_at(lambda e: e.image, effect, _surface(effect)), dtype)
 

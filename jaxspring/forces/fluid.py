@@ -11,8 +11,7 @@ Source: slide "Discrete Fluid Model".
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -22,13 +21,14 @@ from jaxtyping import Array
 
 from .._arrays import Numbers
 from .._checks import constant, is_concrete, kind
-from ..numerics import any_lane, stopped
+from ..memory import entry_at
+from ..numerics import any_lane, cast_inexact, stopped
 from ..state import State
 from ..status import Flag, Status
 from ..topology.base import Topology
 from ..topology.periods import check_dim
 from ..vector import Vector
-from .base import Finding, Force, Step, any_not_positive
+from .base import Finding, Force, Scene, Step, any_not_positive
 from .cutoffs import Cutoff, NoCutoff
 from .molten import Molten, check_springs
 from .pair_drag import PairDrag
@@ -65,6 +65,7 @@ class Fluid(Force):
     [ 0.375 -0.375]
     """
 
+    is_cache: ClassVar[bool] = True
     law: PairLaw
     cutoff: Cutoff
     pairs: Pairs
@@ -98,43 +99,27 @@ class Fluid(Force):
         """The topology that tells what is molten, or None."""
         return None if self.molten is None else self.molten.net
 
-    @property
-    def is_rule(self) -> bool:
-        """Yes: it looks at dt after each step, and keeps its list."""
-        return True
-
-    def with_mass(self, mass: Array) -> Fluid:
-        """The same fluid of these masses [kg]."""
-        return eqx.tree_at(lambda f: f.mass, self, mass, is_leaf=lambda leaf: leaf is None)
-
-    def with_box(self, box: Array | None) -> Fluid:
-        """The same fluid in a box of these periods.
+    def check(self, scene: Scene) -> None:
+        """Refuse a system that it does not fit.
 
         Raises:
-            ValueError: a cut-off, or a radius of the drag, beyond half a period.
+            ValueError: a cut-off, or a radius of the drag, beyond half a period; springs that are not on the net of `molten`.
         """
-        if box is None:
-            return self
-        for name, value in self._within_half().items():
+        box = scene.box
+        for name, value in () if box is None else self._within_half().items():
             if is_concrete(value) and is_concrete(box) and np.any(_is_beyond_half(np.asarray(value), np.asarray(box))):
                 most = float(np.min(np.asarray(box)[np.asarray(box) > 0])) / 2
                 raise ValueError(
                     f"{name} = {value} m is beyond half a period of box = {np.asarray(box)} m: a particle would reach two images of "
                     f"another, of which one acts. Use a larger box, or a {name} of at most {most:.9g} m."
                 )
-        return eqx.tree_at(lambda f: f.box, self, box, is_leaf=lambda leaf: leaf is None)
-
-    def with_forces(self, forces: tuple[Force, ...]) -> Fluid:
-        """The same; refuses a second list, for which a state has no place.
-
-        Raises:
-            ValueError: two fluids with neighbour lists in one system, or springs that are not on the net of `molten`.
-        """
         if self.molten is not None:
-            check_springs("Molten", self.molten.net, forces)
-        if self.pairs.needs_reach and sum(isinstance(f, Fluid) and f.pairs.needs_reach for f in forces) > 1:
-            raise ValueError("two fluids of this system have a NeighbourList, but a state keeps one list. Give one of them AllPairs().")
-        return self
+            check_springs("Molten", self.molten.net, scene.forces)
+
+    def bind(self, scene: Scene) -> Fluid:
+        """The same fluid of these masses, in the box of the net."""
+        ready = eqx.tree_at(lambda f: (f.mass, f.box), self, (scene.mass, scene.box), is_leaf=lambda leaf: leaf is None)
+        return cast_inexact(ready, scene.dtype)
 
     def force(self, state: State) -> Vector:
         """Force on each node [N]."""
@@ -144,12 +129,14 @@ class Fluid(Force):
         """Sum of the pairs' potentials [J]; below zero, without bound for many particles, where the law attracts at every distance."""
         return jnp.sum(self._sum(state, PairTerms.energy, 1)[0])
 
-    def can_feed(self, state: State) -> bool:
-        """No: the pairs have a potential, and drag takes energy out."""
+    @property
+    def can_feed(self) -> bool:
+        """Never: the pairs have a potential, and drag takes energy out."""
         return False
 
-    def is_symmetric(self, state: State) -> bool:
-        """Central forces are; drag that depends on the distance is not."""
+    @property
+    def is_symmetric(self) -> bool:
+        """Whether there is no drag: central forces are symmetric, drag that depends on the distance is not."""
         return self.drag is None
 
     def stiffness_bound(self, state: State) -> Array:
@@ -167,7 +154,7 @@ class Fluid(Force):
         count = self._sum(state, PairTerms.overlap, 1)[0]
         pairs = jnp.round(jnp.sum(count) / 2).astype(jnp.int32)
         findings = (Finding(Flag.OVERLAP, pairs, jnp.argmax(jnp.ravel(count) > 0).astype(jnp.int32)),)
-        needed = self.pairs.needed(state.neighbours)
+        needed = self.pairs.needed(self._list(state))
         nowhere = jnp.asarray(-1, jnp.int32)
         if self.box is not None:
             bad = jnp.any(~(self.box >= 0))
@@ -182,11 +169,19 @@ class Fluid(Force):
         return state.position.largest() * eps / self.law.equilibrium_distance.astype(state.dtype)
 
     def begin(self, state: State) -> State:
-        """The state with the list that its pairs reuse: its own where it serves, else a new one."""
-        position, reach = stopped(self._flat(state)), self.cutoff.reach
-        if state.neighbours is None:
-            return replace(state, neighbours=self.pairs.begin(position, reach, *self._periods))
-        return replace(state, neighbours=self.pairs.keep(state.neighbours, position, reach, *self._periods))
+        """The state with a bit for every spring of `molten`, where springs of other nets break."""
+        net = self.net
+        if net is None or state.alive is None or state.alive_of(net) is not None:
+            return state
+        return state.with_alive(net, net.own(jnp.ones(shape, bool) for shape in net.family_shapes))
+
+    def remember(self, state: State) -> Any:
+        """The list that its pairs reuse, or None."""
+        return self.pairs.begin(stopped(self._flat(state)), self.cutoff.reach, *self._periods)
+
+    def renew(self, memory: Any, state: State) -> Any:
+        """The list where it serves these positions, else a new one."""
+        return self.pairs.keep(memory, stopped(self._flat(state)), self.cutoff.reach, *self._periods)
 
     def update(self, step: Step, state: State) -> tuple[State, Status]:
         """The list brought up to date, and DT_LIMIT where dt is too long for two of the fastest particles that meet head-on."""
@@ -194,17 +189,23 @@ class Fluid(Force):
         memory, status = self._listed(before, still)
         limit, node = self.collision_dt(still)
         too_long = Status.when(Flag.DT_LIMIT, jnp.abs(dt) > limit, node=node)
-        return replace(state, neighbours=memory), status.then(too_long)
+        return state if memory is None else self.keep(state, memory), status.then(too_long)
 
     def _listed(self, before: State, state: State) -> tuple[Any, Status]:
         """The list after a step; left as it is while nothing is fluid."""
+        memory = self._list(state)
 
         def updated() -> tuple[Any, Status]:
-            return self.pairs.update(state.neighbours, self._flat(before), self._flat(state), self.cutoff.reach, *self._periods)
+            return self.pairs.update(memory, self._flat(before), self._flat(state), self.cutoff.reach, *self._periods)
 
-        if self.molten is None or state.neighbours is None:
+        if self.molten is None or memory is None:
             return updated()
-        return lax.cond(any_lane(jnp.any(self.molten.is_fluid(state))), updated, lambda: (state.neighbours, Status.ok()))
+        return lax.cond(any_lane(jnp.any(self.molten.is_fluid(state))), updated, lambda: (memory, Status.ok()))
+
+    def _list(self, state: State) -> Any:
+        """The list that the state remembers, or None."""
+        entry = entry_at(state.memory, self.place)
+        return None if entry is None else entry.value
 
     def collision_dt(self, state: State) -> tuple[Array, Array]:
         """Largest dt [s] at which every particle could meet one as fast head-on, and the flat index of the particle that sets it.
@@ -271,7 +272,7 @@ class Fluid(Force):
             fluid=None if fluid is None else jnp.ravel(fluid).astype(state.dtype),
             velocity=tuple(jnp.ravel(a) for a in state.velocity) if with_velocity else (),
         )
-        memory = self.pairs.ready(state.neighbours, stopped(particles.position), self.cutoff.reach, *self._periods)
+        memory = self.pairs.ready(self._list(state), stopped(particles.position), self.cutoff.reach, *self._periods)
 
         def summed(operands: tuple[Particles, PairTerms, Any]) -> Fields:
             particles, terms, memory = operands
@@ -290,7 +291,7 @@ class Fluid(Force):
 
     def _mass(self, state: State) -> Array:
         if self.mass is None:
-            raise ValueError("Fluid has no masses yet. Put it in a System and ask that, or the forces of system.prepare(state.dtype).")
+            raise ValueError("Fluid has no masses yet. Put it in a System and ask that, or the forces of system.bind(state.dtype).")
         return jnp.broadcast_to(self.mass.astype(state.dtype), state.position.shape)
 
 

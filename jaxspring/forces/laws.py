@@ -40,9 +40,14 @@ class Law(eqx.Module):
     def weight(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
         """Pull per unit of difference [N/m]; the pull is this times `d`."""
 
-    @abc.abstractmethod
     def energy(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array | None:
-        """Energy of the spring [J], or None where the law has none."""
+        """Energy of the spring [J]. A law without one leaves this out."""
+        return None
+
+    @property
+    def has_energy(self) -> bool:
+        """Whether it gives an `energy`."""
+        return type(self).energy is not Law.energy
 
     def slope(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
         """Length times the derivative of the weight by the length [N/m]."""
@@ -165,10 +170,6 @@ class PullLaw(Law):
         """Derivative of the pull by the length, less the weight [N/m]."""
         return _slope_of(self.function, squared_length, stiffness, rest_length)
 
-    def energy(self, squared_length: Array, stiffness: Array, rest_length: Array) -> None:
-        """A pull alone names no energy."""
-        return None
-
 
 @eqx.filter_custom_jvp
 def spring_pull(law: Law, d: Vector, stiffness: Array, rest_length: Array) -> Vector:
@@ -254,7 +255,7 @@ def spring_energy(law: Law, d: Vector, stiffness: Array, rest_length: Array) -> 
     """Energy of each spring [J]; its derivative by `d` is the pull, guarded alike."""
     energy = law.energy(d.dot(d), stiffness, rest_length)
     if energy is None:
-        raise TypeError(f"{type(law).__name__} has no energy.")
+        raise TypeError(f"{type(law).__name__}.energy gives None. A law without an energy leaves the method out.")
     return energy
 
 

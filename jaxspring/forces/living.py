@@ -24,8 +24,7 @@ OfSprings = Callable[..., Any]
 
 def living(net: Topology, state: State) -> EdgeField | None:
     """Which springs of this net hold; None where none breaks, or where those of another net do."""
-    alive = state.alive
-    return alive if alive is not None and net.owns(alive) else None
+    return state.alive_of(net)
 
 
 def heeding(net: Topology, state: State, function: OfSprings, *fields: Any) -> tuple[OfSprings, tuple[Any, ...]]:

@@ -9,10 +9,11 @@ from jaxtyping import Array
 
 from .._arrays import Numbers
 from .._checks import as_inexact, finite, fits_nodes, node_values, shape_of
+from ..numerics import cast_inexact
 from ..state import State
 from ..topology.base import Topology
 from ..vector import Vector
-from .base import Force
+from .base import Force, Scene
 
 
 class Gravity(Force):
@@ -35,9 +36,9 @@ class Gravity(Force):
             )
         self.mass = None if mass is None else node_values("mass", mass)
 
-    def with_mass(self, mass: Array) -> Gravity:
-        """The same gravity acting on these masses; masses that were given stay."""
-        return self if self.mass is not None else Gravity(self.acceleration, mass)
+    def bind(self, scene: Scene) -> Gravity:
+        """The same gravity acting on the masses of the scene; masses that were given stay."""
+        return cast_inexact(self if self.mass is not None else Gravity(self.acceleration, scene.mass), scene.dtype)
 
     def force(self, state: State) -> Vector:
         """Weight m g [N]."""
@@ -111,6 +112,12 @@ class Load(Force):
         """-f . x, summed [J], with the load of the state's time."""
         return -jnp.sum(self.force(state).dot(state.position))
 
-    def is_symmetric(self, state: State) -> bool:
-        """Yes: it does not depend on the position."""
+    @property
+    def has_potential(self) -> bool:
+        """Whether it is constant in time: only then has it an energy."""
+        return isinstance(self.value, Vector)
+
+    @property
+    def is_symmetric(self) -> bool:
+        """Always: a load does not depend on the position."""
         return True

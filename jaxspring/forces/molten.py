@@ -15,7 +15,7 @@ from jaxtyping import Array
 
 from ..state import State
 from ..topology.base import Topology
-from ..topology.edge_field import EdgeField
+from ..topology.edge_field import EdgeField, field_of, fields_of
 from .base import Force
 from .springs import Springs
 
@@ -37,7 +37,9 @@ class Molten(eqx.Module):
         if self.net.n_springs == 0:
             return jnp.ones(self.net.node_shape, bool)
         shapes = self.net.family_shapes
-        alive = self.net.own(jnp.ones(shape, bool) for shape in shapes) if state.alive is None else state.alive
+        all_whole = self.net.own(jnp.ones(shape, bool) for shape in shapes)
+        fields = fields_of(state.alive) or (all_whole,)
+        alive = field_of(self.net, fields) or fields[0]
         given = tuple(entry.shape for entry in alive.families)
         if not self.net.owns(alive) or given != shapes:
             raise ValueError(

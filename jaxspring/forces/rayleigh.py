@@ -18,7 +18,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import equinox as eqx
 from jaxtyping import Array
 
 from .._arrays import Numbers
@@ -28,7 +27,7 @@ from ..numerics import cast_inexact
 from ..state import State
 from ..topology.base import Topology
 from ..vector import Vector
-from .base import Force, any_refused
+from .base import Force, Scene, any_refused
 from .linearisation import Tangent
 
 
@@ -92,21 +91,14 @@ class Rayleigh(Force):
         nets = (getattr(force, "net", None) for force in self.forces or ())
         return next((net for net in nets if net is not None), None)
 
-    def with_mass(self, mass: Array) -> Rayleigh:
-        """The same damping of these masses; masses that were given stay."""
-        return self if self.mass is not None else Rayleigh(self.mass_rate, self.stiffness_time, self.forces, mass)
-
-    def with_forces(self, forces: tuple[Force, ...]) -> Rayleigh:
-        """The same damping of the stiffness of these forces; forces that were given stay."""
-        if self.forces is not None:
-            return self
-        others = tuple(f for f in forces if not isinstance(f, Rayleigh))
-        return Rayleigh(self.mass_rate, self.stiffness_time, others, self.mass)
-
-    def prepare(self, dtype: Any) -> Rayleigh:
-        """Constants of `dtype`, and the forces given made ready."""
-        forces = None if self.forces is None else tuple(f.prepare(dtype) for f in self.forces)
-        return cast_inexact(eqx.tree_at(lambda f: f.forces, self, forces, is_leaf=lambda leaf: leaf is None), dtype)
+    def bind(self, scene: Scene) -> Rayleigh:
+        """The same damping of the masses and the other forces of the scene; masses and forces that were given stay."""
+        if self.forces is None:
+            forces = tuple(scene.bound(i) for i, f in enumerate(scene.forces) if not isinstance(f, Rayleigh))
+        else:
+            forces = tuple(f.bind(scene) for f in self.forces)
+        mass = scene.mass if self.mass is None else self.mass
+        return cast_inexact(Rayleigh(self.mass_rate, self.stiffness_time, forces, mass), scene.dtype)
 
     def force(self, state: State) -> Vector:
         """-(a M + b K) v [N]."""
@@ -123,8 +115,9 @@ class Rayleigh(Force):
                 blocks = blocks + stiffness.scaled(self.stiffness_time)
         return blocks
 
-    def can_feed(self, state: State) -> bool:
-        """No: both terms take energy out."""
+    @property
+    def can_feed(self) -> bool:
+        """Never: both terms take energy out."""
         return False
 
     def damping_bound(self, state: State) -> Array:

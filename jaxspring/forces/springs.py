@@ -27,7 +27,7 @@ from ..topology.base import Topology
 from ..topology.edge_field import EdgeField, SpringNumbers, ZeroOutside
 from ..topology.periods import box_of
 from ..vector import Vector
-from .base import Finding, Force, any_refused
+from .base import Finding, Force, Scene, any_refused
 from .in_box import along_axes, check_rest_length, long_springs, turned_springs
 from .laws import Hooke, Law, PowerLaw, TensionOnly, has_no_direction, length_of, spring_block, spring_energy, spring_pull
 from .lengths import beyond_range
@@ -55,7 +55,7 @@ class StiffnessRule(eqx.Module):
         """Whether a constant has a value that the constructor would refuse."""
         return None
 
-    def prepare(self, net: Topology, dtype: Any) -> StiffnessRule:
+    def bind(self, net: Topology, dtype: Any) -> StiffnessRule:
         """The rule as the loop wants it: constants cast, tables made. Called once, before the loop."""
         return cast_inexact(self, dtype)
 
@@ -130,15 +130,15 @@ class Springs(Force):
             for entry in self.rest_length.families if isinstance(self.rest_length, EdgeField) else (self.rest_length,):
                 positive("rest_length", entry, "The power law divides by it.")
 
-    def prepare(self, dtype: Any) -> Springs:
-        """Constants as edge fields of `dtype`."""
+    def bind(self, scene: Scene) -> Springs:
+        """Constants as edge fields."""
         rule = self.stiffness
-        stiffness = rule.prepare(self.net, dtype) if isinstance(rule, StiffnessRule) else self.net.edge_field(rule, "stiffness")
+        stiffness = rule.bind(self.net, scene.dtype) if isinstance(rule, StiffnessRule) else self.net.edge_field(rule, "stiffness")
         if isinstance(stiffness, EdgeField):
             # Pulls then vanish in a lattice's margins of themselves, and no step need mask them.
             stiffness = ZeroOutside(self.net.inside(stiffness, 0).families)
         ready = eqx.tree_at(lambda s: (s.stiffness, s.rest_length), self, (stiffness, self.net.edge_field(self.rest_length, "rest_length")))
-        return cast_inexact(ready, dtype)
+        return cast_inexact(ready, scene.dtype)
 
     def force(self, state: State) -> Vector:
         """Sum of the pulls at each node [N]."""
@@ -154,10 +154,7 @@ class Springs(Force):
         """Sum of the springs' energies [J]; None where the law has none."""
         if self.net.n_springs == 0:
             return jnp.zeros((), state.dtype)
-        if self._follows_position:
-            return None
-        one = jnp.ones((), state.dtype)
-        if self.law.energy(one, one, one) is None:
+        if not self.has_potential:
             return None
         return self.net.sum(self._each(state, partial(spring_energy, self.law)))
 
@@ -171,13 +168,20 @@ class Springs(Force):
             return Blocks(springs=(SpringBlocks(self.net, weight, None, None, self.axes),))
         return Blocks(springs=(SpringBlocks(self.net, weight, slope, direction, self.axes),))
 
-    def is_symmetric(self, state: State) -> bool:
-        """Central forces are, unless the stiffness depends on position."""
+    @property
+    def has_potential(self) -> bool:
+        """Whether the law has an energy, and the stiffness does not follow the position."""
+        return not self._follows_position and (self.net.n_springs == 0 or self.law.has_energy)
+
+    @property
+    def is_symmetric(self) -> bool:
+        """Whether the stiffness does not follow the position: central forces are symmetric then."""
         return not self._follows_position
 
-    def can_feed(self, state: State) -> bool:
+    @property
+    def can_feed(self) -> bool:
         """Whether stiffness or rest length follow the state, or the law has no potential."""
-        return isinstance(self.stiffness, StiffnessRule) or self.expansion is not None or self.energy(state) is None
+        return isinstance(self.stiffness, StiffnessRule) or self.expansion is not None or not self.has_potential
 
     def tension(self, state: State) -> EdgeField:
         """Pull of each spring along itself [N]: positive stretched, negative squeezed, zero broken. `net.flatten` gives (E,)."""
@@ -259,9 +263,8 @@ class Springs(Force):
 
     def natural_length(self, state: State) -> Array | EdgeField:
         """Rest length of each spring in this state [m]: the state's own where it has one, else the given one, times the expansion."""
-        changed = state.rest_length
-        is_changed = changed is not None and self.net.owns(changed)
-        l: Any = changed if is_changed else cast_inexact(self.net.edge_field(self.rest_length, "rest_length"), state.dtype)
+        changed = state.rest_length_of(self.net)
+        l: Any = changed if changed is not None else cast_inexact(self.net.edge_field(self.rest_length, "rest_length"), state.dtype)
         if self.expansion is None:
             return l
         factor = cast_inexact(self.expansion, state.dtype).factor(self.net, state)

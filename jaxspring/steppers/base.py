@@ -8,10 +8,10 @@ from typing import Any
 import equinox as eqx
 from jaxtyping import Array
 
+from ..bound import BoundSystem
 from ..forces.base import Force
 from ..linalg.base import SolveInfo
 from ..state import State
-from ..system import System
 
 
 class Stepper(eqx.Module):
@@ -21,15 +21,15 @@ class Stepper(eqx.Module):
     returns it from `init` and from every `step`. Held nodes: call `system.hold` on what you add to the velocity.
     """
 
-    def init(self, system: System, state: State) -> Any:
+    def init(self, system: BoundSystem, state: State) -> Any:
         """What the stepper carries before its first step; None where it carries nothing."""
         return None
 
     @abc.abstractmethod
-    def step(self, system: System, state: State, dt: Array, memory: Any) -> tuple[State, Any]:
+    def step(self, system: BoundSystem, state: State, dt: Array, memory: Any) -> tuple[State, Any]:
         """The state one `dt` [s] later, and what to carry. The caller sets the new state's time."""
 
-    def after_rules(self, system: System, before: State, moved: State, now: State, dt: Array, memory: Any) -> Any:
+    def after_rules(self, system: BoundSystem, before: State, moved: State, now: State, dt: Array, memory: Any) -> Any:
         """What to carry where rules have changed positions or velocities: the step began at `before`, motion ended at `moved`, rules left
         `now`. A stepper that carries what belongs to a place or a velocity makes it anew; called only where a rule may change them.
         """

@@ -14,10 +14,10 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ..bound import BoundSystem
 from ..linalg.iterative import norm
 from ..numerics import stopped
 from ..state import State
-from ..system import System
 from .stage import Stage
 
 
@@ -38,14 +38,14 @@ class EnergyWatch(eqx.Module):
     drift: Array
 
     @staticmethod
-    def of(system: System, state: State) -> EnergyWatch | None:
+    def of(system: BoundSystem, state: State) -> EnergyWatch | None:
         """Before the first step; None where something in the system can feed energy in."""
-        if system.motion is not None or any(force.can_feed(state) for force in system.forces):
+        if system.motion is not None or any(force.can_feed for force in system.forces):
             return None
         parts = _parts(system, state)
         return EnergyWatch(parts, jnp.sum(parts), parts, parts, jnp.zeros((), state.dtype))
 
-    def shifted(self, system: System, state: State) -> EnergyWatch:
+    def shifted(self, system: BoundSystem, state: State) -> EnergyWatch:
         """After rules have changed the energy, which is no fault of a step."""
         parts = _parts(system, state)
         return eqx.tree_at(lambda w: (w.parts, w.lowest), self, (parts, self.lowest + jnp.sum(parts - self.parts)))
@@ -75,7 +75,7 @@ class EnergyWatch(eqx.Module):
         return jnp.sum(self.parts) - self.lowest > slack * scale + rounding + self.drift
 
 
-def _parts(system: System, state: State) -> Array:
+def _parts(system: BoundSystem, state: State) -> Array:
     """Kinetic energy, then the potentials that there are [J]."""
     energy = stopped(system.energy(state))
     return jnp.stack([energy.kinetic, *(part for part in energy.potential if part is not None)])

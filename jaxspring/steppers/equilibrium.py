@@ -12,7 +12,6 @@ Source: Steihaug (1983) for the truncated iteration; Conn, Gould and Toint, Trus
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable
 from typing import Any
@@ -23,6 +22,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from ..bound import BoundSystem
 from ..forces.base import SPOILT
 from ..forces.linearisation import Tangent
 from ..linalg.base import SolveInfo
@@ -111,7 +111,7 @@ def equilibrium(
 class _Scene(eqx.Module):
     """What is given: the system, and the state at which displacements are zero."""
 
-    system: System
+    system: BoundSystem
     start: State
 
     def at(self, u: Vector) -> State:
@@ -146,7 +146,7 @@ class _Balance(Converged):
 
     def nearby(self, scene: _Scene, u: Vector) -> tuple[SpringMatrix, bool]:
         """The preconditioner's matrix."""
-        return scene.matrix(u), scene.system.is_symmetric(scene.at(u))
+        return scene.matrix(u), scene.system.is_symmetric
 
 
 class _Progress(eqx.Module):
@@ -271,7 +271,7 @@ class _Search(eqx.Module):
         return self.tolerance or (1e-10 if dtype == jnp.float64 else 1e-5)
 
 
-def _push(system: System, like: Vector) -> Vector:
+def _push(system: BoundSystem, like: Vector) -> Vector:
     """A fixed force that feels every direction in which the net may give way."""
     keys = jax.random.split(jax.random.key(0), like.dim)
     return system.hold(Vector(tuple(jax.random.normal(key, like.shape, like.dtype) for key in keys)))
@@ -279,9 +279,9 @@ def _push(system: System, like: Vector) -> Vector:
 
 @eqx.filter_jit
 def _find(search: _Search, system: System, state: State) -> Equilibrium:
-    ready = system.prepare(state.dtype)
-    # A list of neighbours is kept up to date by rollout alone: without one each evaluation makes its own.
-    start = ready.constrain(dataclasses.replace(state, neighbours=None))
+    ready = system.bind(state.dtype)
+    # A cache is kept up to date by rollout alone: without it each evaluation makes its own. Histories are held.
+    start = ready.alone(state)
     # Free nodes end at the same place wherever they start; only held ones carry a derivative.
     anchor = ready.matrix(Blocks(), start).pick(stopped(start.position), start.position)
     scene = _Scene(ready, start.moved(anchor, Vector.zeros_like(anchor)))

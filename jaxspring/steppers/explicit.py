@@ -25,9 +25,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from ..bound import BoundSystem
 from ..numerics import any_lane
 from ..state import State
-from ..system import System
 from ..vector import Vector
 from .base import Stepper
 
@@ -35,7 +35,7 @@ from .base import Stepper
 class ForwardEuler(Stepper):
     """Forward Euler: unstable for undamped springs at every dt; here for contrast."""
 
-    def step(self, system: System, state: State, dt: Array, memory: None) -> tuple[State, None]:
+    def step(self, system: BoundSystem, state: State, dt: Array, memory: None) -> tuple[State, None]:
         """X + dt v, v + dt a."""
         a = system.acceleration(state)
         return state.moved(state.position + dt * state.velocity, state.velocity + dt * a), None
@@ -48,7 +48,7 @@ class ForwardEuler(Stepper):
 class SymplecticEuler(Stepper):
     """Symplectic (semi-implicit) Euler, kick then drift: the slides' update."""
 
-    def step(self, system: System, state: State, dt: Array, memory: None) -> tuple[State, None]:
+    def step(self, system: BoundSystem, state: State, dt: Array, memory: None) -> tuple[State, None]:
         """V + dt a, then x + dt of the new v."""
         v = state.velocity + dt * system.acceleration(state)
         return state.moved(state.position + dt * v, v), None
@@ -61,11 +61,11 @@ class SymplecticEuler(Stepper):
 class VelocityVerlet(Stepper):
     """Velocity Verlet. It carries the acceleration, so that a step costs one evaluation of the forces."""
 
-    def init(self, system: System, state: State) -> Vector:
+    def init(self, system: BoundSystem, state: State) -> Vector:
         """The acceleration at the start."""
         return system.acceleration(state)
 
-    def step(self, system: System, state: State, dt: Array, memory: Vector) -> tuple[State, Vector]:
+    def step(self, system: BoundSystem, state: State, dt: Array, memory: Vector) -> tuple[State, Vector]:
         """Drift with the old acceleration, kick with the mean of old and new."""
         a = memory
         x = state.position + dt * (state.velocity + (0.5 * dt) * a)
@@ -73,7 +73,7 @@ class VelocityVerlet(Stepper):
         a_new = system.acceleration(predicted)
         return state.moved(x, state.velocity + (0.5 * dt) * (a + a_new)), a_new
 
-    def after_rules(self, system: System, before: State, moved: State, now: State, dt: Array, memory: Vector) -> Vector:
+    def after_rules(self, system: BoundSystem, before: State, moved: State, now: State, dt: Array, memory: Vector) -> Vector:
         """The acceleration where the rules have left the nodes, made anew in steps in which they changed any."""
         pairs = [*zip(now.position, moved.position, strict=True), *zip(now.velocity, moved.velocity, strict=True)]
         is_changed = jnp.any(jnp.stack([jnp.any(a != b) for a, b in pairs]))
@@ -87,7 +87,7 @@ class VelocityVerlet(Stepper):
 class RungeKutta4(Stepper):
     """The classical Runge-Kutta method of order 4: four evaluations of the forces in a step."""
 
-    def step(self, system: System, state: State, dt: Array, memory: None) -> tuple[State, None]:
+    def step(self, system: BoundSystem, state: State, dt: Array, memory: None) -> tuple[State, None]:
         """X and v by four stages."""
 
         def slope(fraction: float, dx: Vector | None, dv: Vector | None) -> tuple[Vector, Vector]:

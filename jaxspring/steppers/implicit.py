@@ -23,6 +23,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ..bound import BoundSystem
 from ..forces.linearisation import Linearisation, Tangent
 from ..linalg.base import LinearSolver, SolveInfo
 from ..linalg.cg import JaxCG
@@ -30,7 +31,6 @@ from ..linalg.exact import ExactSolver
 from ..linalg.implicit import grown
 from ..state import State
 from ..status import NOWHERE, Flag, Status
-from ..system import System
 from ..vector import Vector
 from .base import Stepper
 from .energy_watch import EnergyWatch
@@ -97,7 +97,7 @@ class ImplicitStepper(Stepper):
         """Whether the order of the method needs converged steps."""
 
     @abc.abstractmethod
-    def stage(self, system: System, state: State, dt: Array, history: Any) -> Stage:
+    def stage(self, system: BoundSystem, state: State, dt: Array, history: Any) -> Stage:
         """The equations of this step."""
 
     @abc.abstractmethod
@@ -119,7 +119,7 @@ class ImplicitStepper(Stepper):
         """
         return 2e-5 if dtype == jnp.float64 else 1e-3
 
-    def init(self, system: System, state: State) -> Memory:
+    def init(self, system: BoundSystem, state: State) -> Memory:
         """An empty memory of the right shape."""
         dt = jnp.ones((), state.dtype)
         history = self.first_history(state)
@@ -133,7 +133,7 @@ class ImplicitStepper(Stepper):
         """No: backward in time the matrix is not positive definite."""
         return False
 
-    def step(self, system: System, state: State, dt: Array, memory: Memory) -> tuple[State, Memory]:
+    def step(self, system: BoundSystem, state: State, dt: Array, memory: Memory) -> tuple[State, Memory]:
         """One stage, and the state after it; with dt = 0, which no matrix survives, the state itself."""
         stands = dt == 0
         # In so short a step masses outweigh all else: what is computed in vain never fails.
@@ -143,7 +143,7 @@ class ImplicitStepper(Stepper):
         old = state.moved(state.position + dx, state.velocity + dv, new.time)
         return jax.tree.map(lambda old, moved: jnp.where(stands, old, moved), old, new), after
 
-    def _step(self, system: System, state: State, dt: Array, memory: Memory) -> tuple[State, Memory]:
+    def _step(self, system: BoundSystem, state: State, dt: Array, memory: Memory) -> tuple[State, Memory]:
         stage = self.stage(system, state, dt, memory.history)
         if self.newton is None:
             problem: Any = LinearStage(self.solver, self.stiffness)
@@ -175,7 +175,7 @@ class BackwardEuler(ImplicitStepper):
         """No: one linear solve keeps order 1."""
         return False
 
-    def stage(self, system: System, state: State, dt: Array, history: None) -> Stage:
+    def stage(self, system: BoundSystem, state: State, dt: Array, history: None) -> Stage:
         """The forces at the end of the step."""
         return _stage(system, state, state.position, state.velocity, dt, state.time + dt)
 
@@ -197,7 +197,7 @@ class ImplicitMidpoint(ImplicitStepper):
         """Yes: the clamped tangent of a single solve would lower the order where springs are squeezed."""
         return True
 
-    def stage(self, system: System, state: State, dt: Array, history: None) -> Stage:
+    def stage(self, system: BoundSystem, state: State, dt: Array, history: None) -> Stage:
         """The forces in the middle of the step."""
         return _stage(system, state, state.position, state.velocity, 0.5 * dt, state.time + 0.5 * dt)
 
@@ -229,7 +229,7 @@ class BDF2(ImplicitStepper):
         """The state before this step."""
         return jnp.ones((), bool), state.position, state.velocity
 
-    def after_rules(self, system: System, before: State, moved: State, now: State, dt: Array, memory: Memory) -> Memory:
+    def after_rules(self, system: BoundSystem, before: State, moved: State, now: State, dt: Array, memory: Memory) -> Memory:
         """For nodes that rules have moved or kicked, the state dt ago from which this step's acceleration a would have led here:
         x' - dt v' + dt^2 a / 2 and v' - dt a.
         """
@@ -244,7 +244,7 @@ class BDF2(ImplicitStepper):
         past = now.position - dt * now.velocity + (0.5 * dt) * gained
         return eqx.tree_at(lambda m: m.history, memory, (has_last, pick(past, x), pick(now.velocity - gained, v)))
 
-    def stage(self, system: System, state: State, dt: Array, history: tuple[Array, Vector, Vector]) -> Stage:
+    def stage(self, system: BoundSystem, state: State, dt: Array, history: tuple[Array, Vector, Vector]) -> Stage:
         """Differences of this state and the last one, in the form that leaves a node at rest exactly where it is."""
         has_last, x, v = history
         third = jnp.where(has_last, jnp.asarray(1 / 3, dt.dtype), jnp.zeros((), dt.dtype))
@@ -261,7 +261,7 @@ class BDF2(ImplicitStepper):
         return 0.1
 
 
-def _rates(scene: tuple[System, State]) -> tuple[Vector, Vector]:
+def _rates(scene: tuple[BoundSystem, State]) -> tuple[Vector, Vector]:
     """How fast positions and velocities change."""
     system, state = scene
     return state.velocity, system.acceleration(state)
@@ -280,7 +280,7 @@ def _breakdown(stage: Stage, after: State) -> Status:
     return eqx.tree_at(lambda s: s.effect, status, jnp.where(jnp.any(bad), effect, status.effect))
 
 
-def _stage(system: System, state: State, origin: Vector, velocity: Vector, h: Array, time: Array) -> Stage:
+def _stage(system: BoundSystem, state: State, origin: Vector, velocity: Vector, h: Array, time: Array) -> Stage:
     predictor = state.moved(state.position, state.velocity, time)
     return Stage(system, origin, velocity, h, time, predictor, *known_velocities(system, origin, h, time), origin is state.position)
 

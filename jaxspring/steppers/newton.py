@@ -83,7 +83,7 @@ class NewtonStage(Converged):
     def nearby(self, stage: Stage, y: Vector) -> tuple[SpringMatrix, bool]:
         """The clamped matrix."""
         state = stopped(stage.reached(y))
-        return stage.matrix(state, Tangent()), stage.system.is_symmetric(state)
+        return stage.matrix(state, Tangent()), stage.system.is_symmetric
 
     def solve(self, stage: Stage, memory: Any) -> tuple[Vector, SolveInfo, Any]:
         """The stage's velocity with its derivative, how the solve ended, and what the solver carries on."""

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from ..bound import BoundSystem
 from ..forces.base import Force
 from ..linalg.base import LinearSolver, SolveInfo
 from ..linalg.cg import JaxCG
@@ -27,7 +28,6 @@ from ..linalg.operators import Blocks, SpringMatrix, isotropic
 from ..numerics import stopped
 from ..state import State
 from ..status import Status
-from ..system import System
 from ..vector import Vector
 from .base import Stepper
 from .explicit import SymplecticEuler
@@ -51,7 +51,7 @@ class SemiImplicit(Stepper):
     def __init__(self, solver: LinearSolver | None = None):
         self.solver = JaxCG() if solver is None else solver
 
-    def init(self, system: System, state: State) -> Memory | None:
+    def init(self, system: BoundSystem, state: State) -> Memory | None:
         """What the solver carries; None where nothing is solved."""
         kick = _Kick(system, state, jnp.ones((), state.dtype))
         if kick.is_diagonal:
@@ -59,7 +59,7 @@ class SemiImplicit(Stepper):
         nothing = SolveInfo(jnp.zeros((), state.dtype), jnp.zeros((), jnp.int32), Status.ok())
         return Memory(self.solver.init(kick.matrix()), nothing, None, None)
 
-    def step(self, system: System, state: State, dt: Array, memory: Memory | None) -> tuple[State, Memory | None]:
+    def step(self, system: BoundSystem, state: State, dt: Array, memory: Memory | None) -> tuple[State, Memory | None]:
         """V + dv, then x + dt of the new v."""
         kick = _Kick(system, state, dt)
         if memory is None:
@@ -92,7 +92,7 @@ class SemiImplicit(Stepper):
 class _Kick(eqx.Module):
     """What is given of a step: the equations (M + dt G) dv = dt f."""
 
-    system: System
+    system: BoundSystem
     state: State
     dt: Array
 

@@ -16,6 +16,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ..bound import BoundSystem
 from ..state import State
 from ..system import System
 from .base import Stepper
@@ -40,20 +41,20 @@ def stable_dt(system: System, state: State, stepper: Stepper | None = None) -> A
     2.0
     """
     stepper = SymplecticEuler() if stepper is None else stepper
-    limit = dt_limit(system.prepare(state.checked().dtype), state, stepper)
+    limit = dt_limit(system.bind(state.checked().dtype), state, stepper)
     if limit is None:
         raise TypeError(f"{type(stepper).__name__} has no known stability limit (its `limit` returns None).")
     return limit
 
 
-def dt_limit(system: System, state: State, stepper: Stepper) -> Array | None:
-    """As `stable_dt`, for a prepared system; None for a stepper that does not know its limit."""
+def dt_limit(system: BoundSystem, state: State, stepper: Stepper) -> Array | None:
+    """As `stable_dt`, for a bound system; None for a stepper that does not know its limit."""
     limits = [stepper.limit(*_bounds(system, state, stepper)), *(rule.limit(state) for rule in system.rules or ())]
     known = [limit for limit in limits if limit is not None]
     return functools.reduce(jnp.minimum, known) if known else None
 
 
-def _bounds(system: System, state: State, stepper: Stepper) -> tuple[Array, Array, Array]:
+def _bounds(system: BoundSystem, state: State, stepper: Stepper) -> tuple[Array, Array, Array]:
     """Squared frequency, damping rate and its floor, over the free nodes; the damping as far as it is taken at an old velocity."""
     lagged = [effect for effect in system.forces if stepper.lags_damping(effect, state)]
     inverse = 1 / system.mass.astype(state.dtype)

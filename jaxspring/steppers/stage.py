@@ -21,6 +21,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from ..bound import BoundSystem
 from ..forces.linearisation import Linearisation
 from ..linalg.base import LinearSolver, SolveInfo
 from ..linalg.implicit import ImplicitProblem, implicitly
@@ -28,7 +29,6 @@ from ..linalg.iterative import norm
 from ..linalg.operators import Blocks, SpringMatrix, isotropic
 from ..numerics import stopped
 from ..state import State
-from ..system import System
 from ..vector import Vector
 
 
@@ -47,7 +47,7 @@ class Stage(eqx.Module):
         starts_there: whether x0 is the predictor's position (static).
     """
 
-    system: System
+    system: BoundSystem
     origin: Vector
     velocity: Vector
     h: Array
@@ -143,7 +143,7 @@ class LinearStage(ImplicitProblem):
         return b - stage.system.stiffness_blocks(at, self.linearisation).product(stage.origin - at.position)
 
 
-def known_velocities(system: System, origin: Vector, h: Array, time: Array) -> tuple[Vector, Vector | None]:
+def known_velocities(system: BoundSystem, origin: Vector, h: Array, time: Array) -> tuple[Vector, Vector | None]:
     """Of the held (zero) and of the moved coordinates, the velocity that leads to their place at `time` and that at `time` [m/s]."""
     zero = Vector.zeros_like(origin)
     if system.motion is None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ..bound import BoundSystem
 from ..state import State
-from ..system import System
 from .base import Stepper
 
 
@@ -16,7 +16,7 @@ class Still(Stepper):
     Forces are not evaluated. Nodes on a schedule still follow it.
     """
 
-    def step(self, system: System, state: State, dt: Array, memory: None) -> tuple[State, None]:
+    def step(self, system: BoundSystem, state: State, dt: Array, memory: None) -> tuple[State, None]:
         """The same state."""
         return state, None
 

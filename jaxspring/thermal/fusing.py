@@ -11,15 +11,14 @@ Source: Terzopoulos, Platt and Fleischer (1989): a thermoelastic unit fuses abov
 
 from __future__ import annotations
 
-import dataclasses
-
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._arrays import Numbers
 from .._checks import as_inexact, finite, has_shape, nonnegative, positive
-from ..forces.base import Force, Rule, Step
+from ..forces.base import Rule, Scene, Step
+from ..forces.living import living
 from ..forces.molten import Molten, check_springs
 from ..forces.springs import Springs
 from ..numerics import cast_inexact
@@ -85,53 +84,48 @@ class Fusing(Rule):
         self.refreezing = refreezing
         self.springs = None
 
-    def with_forces(self, forces: tuple[Force, ...]) -> Fusing:
-        """The same, knowing the springs that may come back.
+    def check(self, scene: Scene) -> None:
+        """Raise ValueError where no `Springs` of the system is on this net, or several that may come back."""
+        check_springs("Fusing", self.net, scene.forces)
+        if self.refreezing is not None and len(self._own(scene)) != 1:
+            raise ValueError(
+                f"refreezing needs one Springs on the net of Fusing, whose rest lengths change; this system has {len(self._own(scene))}."
+            )
 
-        Raises ValueError where no `Springs` of the system is on this net.
-        """
-        check_springs("Fusing", self.net, forces)
-        if self.refreezing is None:
-            return self
-        own = [f for f in forces if isinstance(f, Springs) and f.net.identity == self.net.identity]
-        if len(own) != 1:
-            raise ValueError(f"refreezing needs one Springs on the net of Fusing, whose rest lengths change; this system has {len(own)}.")
-        return eqx.tree_at(lambda r: r.springs, self, own[0], is_leaf=lambda leaf: leaf is None)
+    def bind(self, scene: Scene) -> Fusing:
+        """The same, knowing the springs that may come back."""
+        springs = None if self.refreezing is None else scene.bound(self._own(scene)[0])
+        return cast_inexact(eqx.tree_at(lambda r: r.springs, self, springs, is_leaf=lambda leaf: leaf is None), scene.dtype)
+
+    def _own(self, scene: Scene) -> list[int]:
+        """The places of the springs on this net."""
+        return [i for i, f in enumerate(scene.forces) if isinstance(f, Springs) and f.net.identity == self.net.identity]
 
     def begin(self, state: State) -> State:
         """The state with a bit for every spring and, where springs come back, a rest length of every spring."""
         temperature_of(state, "Fusing")
-        alive = state.alive
+        alive = state.alive_of(self.net)
         if alive is None:
             alive = self.net.own(jnp.ones(shape, bool) for shape in self.net.family_shapes)
-        elif not self.net.owns(alive):
-            raise ValueError(
-                f"state.alive is of another net than Fusing: it tells about the springs of {alive.identity or 'no known net'}, and Fusing "
-                f"about those of {self.net.identity}. A state knows the broken springs of one net only: build both on it."
-            )
         # The same kind of field as a step leaves it, also where it was made by hand.
-        state = dataclasses.replace(state, alive=self.net.own(alive.families))
-        if self.refreezing is not None and self.springs is not None and state.rest_length is None:
+        state = state.with_alive(self.net, alive)
+        if self.refreezing is None or self.springs is None:
+            return state
+        lengths = state.rest_length_of(self.net)
+        if lengths is None:
             given = cast_inexact(self.springs.net.edge_field(self.springs.rest_length, "rest_length"), state.dtype)
-            lengths = given.families if isinstance(given, EdgeField) else (given,) * len(self.net.family_shapes)
-            full = tuple(jnp.broadcast_to(l, shape) for l, shape in zip(lengths, self.net.family_shapes, strict=True))
-            state = dataclasses.replace(state, rest_length=self.net.own(full))
-        elif state.rest_length is not None and self.refreezing is not None:
-            if not self.net.owns(state.rest_length):
-                raise ValueError(
-                    f"state.rest_length is of another net than Fusing, whose net is {self.net.identity}. Build both on that net."
-                )
-            state = dataclasses.replace(state, rest_length=self.net.own(state.rest_length.families))
-        return state
+            entries = given.families if isinstance(given, EdgeField) else (given,) * len(self.net.family_shapes)
+            lengths = self.net.own(jnp.broadcast_to(l, shape) for l, shape in zip(entries, self.net.family_shapes, strict=True))
+        return state.with_rest_length(self.net, lengths)
 
     def update(self, step: Step, state: State) -> tuple[State, Status]:
         """Springs broken where hot, and back where cold and near."""
         melting = self.melting.astype(state.dtype)
         warm = self.net.average(temperature_of(state, "Fusing"))
-        alive = self.net.map_springs(lambda whole, theta: whole & (theta < melting), state.alive, warm)
+        alive = self.net.map_springs(lambda whole, theta: whole & (theta < melting), living(self.net, state), warm)
         refused = Status.when(Flag.INVALID, ~jnp.isfinite(melting))
         if self.refreezing is None:
-            return dataclasses.replace(state, alive=alive), refused
+            return state.with_alive(self.net, alive), refused
         cold, reach = melting - self.refreezing.hysteresis.astype(state.dtype), self.refreezing.reach.astype(state.dtype)
         length = self.net.difference(state.position).map(lambda d: d.norm())
         back = self.net.map_springs(
@@ -141,8 +135,8 @@ class Fusing(Rule):
         if self.springs is not None and self.springs.expansion is not None:
             factor = self.springs.expansion.factor(self.net, state)
             natural = self.net.map_springs(lambda l, f: l / jnp.where(f > 0, f, jnp.ones_like(f)), length, factor)
-        rest = self.net.map_springs(jnp.where, back, natural, state.rest_length)
-        return dataclasses.replace(state, alive=self.net.map_springs(jnp.logical_or, alive, back), rest_length=rest), refused
+        rest = self.net.map_springs(jnp.where, back, natural, state.rest_length_of(self.net))
+        return state.with_alive(self.net, self.net.map_springs(jnp.logical_or, alive, back)).with_rest_length(self.net, rest), refused
 
 
 def melted_fraction(net: Topology, state: State) -> Array:

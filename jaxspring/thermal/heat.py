@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -21,13 +21,13 @@ from jaxtyping import Array
 
 from .._arrays import Numbers
 from .._checks import as_inexact, finite, nonnegative, positive
-from ..forces.base import Rule, Step, any_refused
+from ..forces.base import Rule, Scene, Step, any_refused
 from ..linalg.operators import SpringBlocks
 from ..numerics import cast_inexact, stopped
 from ..state import State
 from ..status import Flag, Status
 from ..topology.base import Topology
-from ..topology.edge_field import EdgeField, SpringNumbers
+from ..topology.edge_field import EdgeField, SpringNumbers, fields_of
 from ..topology.lattice import Lattice
 from .boundaries import ThermalBoundary
 from .flow import Flow
@@ -40,11 +40,11 @@ class Heat(Rule):
 
     Attributes:
         net: along whose springs heat flows; its nodes are the system's, its springs may be others.
-        capacity: C [J/K], a number or a node array.
+        capacity: C [J/K], a number, or (N,) in the user's order; once bound, a node array.
         conductance: G [W/K], a number, (E,) in the user's order, or an `EdgeField`.
         scheme: how it is advanced.
         boundaries: what enters from outside.
-        source: heat made in each node [W]: a number, a node array, or a function of time [s] that gives one; None is none.
+        source: heat made in each node [W]: a number, (N,) in the user's order, or a function of time [s] that gives one; None is none.
         latent: melting, or None.
         cut_by: the net whose broken springs (`state.alive`) conduct nothing; None where breaking does not cut.
         substeps: heat steps in one step of the nodes (static).
@@ -64,6 +64,7 @@ class Heat(Rule):
     [300. 325. 375.]
     """
 
+    sets_temperature: ClassVar[bool] = True
     net: Topology
     capacity: Array
     conductance: Any
@@ -107,25 +108,22 @@ class Heat(Rule):
         self.net = net
         capacity = as_inexact("capacity", capacity)
         positive("capacity", capacity, "A node without capacity would get an infinite temperature.")
-        self.capacity = net.node_field(capacity, "capacity")
+        net.node_field(capacity, "capacity")  # refuses a wrong shape
+        self.capacity = capacity
         self.conductance = _conductance(net, conductance)
         self.scheme = _kind("scheme", ExplicitHeat() if scheme is None else scheme, HeatScheme)
         self.scheme.check(net)
         given = tuple(boundaries) if isinstance(boundaries, Iterable) else (boundaries,)
-        self.boundaries = tuple(_kind(f"boundaries[{i}]", b, ThermalBoundary).on(net, f"boundaries[{i}]") for i, b in enumerate(given))
+        self.boundaries = tuple(_kind(f"boundaries[{i}]", b, ThermalBoundary) for i, b in enumerate(given))
         self.source = source if source is None or callable(source) else _source(net, source)
-        self.latent = None if latent is None else _kind("latent", latent, LatentHeat).on(net)
+        self.latent = None if latent is None else _kind("latent", latent, LatentHeat)
+        self._on_net()  # refuses what does not fit
         for name, count in (("substeps", substeps), ("every", every)):
             if isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 1:
                 raise ValueError(f"{name} = {count!r}; expected a whole number, 1 or more.")
         self.substeps, self.every = int(substeps), int(every)
         self.cut_by = cut_by
         self.families = None if cut_by is None else _shared_families(net, cut_by)
-
-    @property
-    def sets_temperature(self) -> bool:
-        """Yes."""
-        return True
 
     def begin(self, state: State) -> State:
         """The state with given temperatures in their place and, with latent heat, an enthalpy.
@@ -139,7 +137,7 @@ class Heat(Rule):
                 "the state holds latent heat (enthalpy), but this Heat knows no melting, so that it would never come back. Pass "
                 "latent=LatentHeat(...), or a state with enthalpy=None."
             )
-        ready = self.prepare(state.dtype)
+        ready = self.ready(state.dtype)
         flow = ready.flow(state, cuts=False)
         return _left(flow, flow.hold(flow.entered(state.temperature, state.enthalpy)), state)
 
@@ -147,15 +145,14 @@ class Heat(Rule):
         """Heat for a time dt, with the nodes where motion left them."""
         before, dt = step.before, step.dt
         refused = Status.when(Flag.INVALID, dt < 0)
-        ready = self.prepare(state.dtype)
-        flow = ready.flow(state, cuts=self.cut_by is not None)
+        flow = self.flow(state, cuts=self.cut_by is not None)
         y = flow.entered(_temperature(state), state.enthalpy)
         if self.every == 1:
-            y, status = ready._advanced(flow, y, dt)
+            y, status = self._advanced(flow, y, dt)
         else:
             is_due = self._count(state.time, dt) > self._count(before.time, dt)
-            y, status = lax.cond(is_due, lambda y: ready._advanced(flow, y, self.every * dt), lambda y: (y, Status.ok()), y)
-        return _left(flow, y, state), refused.then(status).then(ready._too_long(before, state, dt))
+            y, status = lax.cond(is_due, lambda y: self._advanced(flow, y, self.every * dt), lambda y: (y, Status.ok()), y)
+        return _left(flow, y, state), refused.then(status).then(self._too_long(before, state, dt))
 
     def _count(self, time: Array, dt: Array) -> Array:
         """Heat steps that were due up to a time: they fall on the multiples of every * dt.
@@ -193,15 +190,14 @@ class Heat(Rule):
 
     def limit(self, state: State) -> Array | None:
         """Largest dt [s] of the nodes' steps at which an explicit scheme is stable and makes no new extreme; None for the others."""
-        ready = self.prepare(state.dtype)
-        return ready._limit(ready._rate(state))
+        return self._limit(self._rate(state))
 
     def _limit(self, rate: Array) -> Array | None:
         limit = self.scheme.limit(jnp.max(rate))
         return None if limit is None else limit * self.substeps / self.every
 
     def _rate(self, state: State) -> Array:
-        """Share of its heat that each free node gives away per time, at most [1/s]; of a prepared rule."""
+        """Share of its heat that each free node gives away per time, at most [1/s]; of a bound rule."""
         out = self.net.incident_sum(self.conductance).astype(state.dtype)
         for boundary in self.boundaries:
             slope = boundary.slope_bound(state, _temperature(state))
@@ -212,11 +208,11 @@ class Heat(Rule):
 
     def power(self, state: State) -> Array:
         """Heat per time into each node [W], in node shape: conduction, sources and boundaries."""
-        return self.prepare(state.dtype).flow(state, cuts=self.cut_by is not None).power(_temperature(state))
+        return self.ready(state.dtype).flow(state, cuts=self.cut_by is not None).power(_temperature(state))
 
     def supplied(self, state: State) -> Array:
         """Heat per time into each node from outside [W], in node shape: sources and boundaries but fixed temperatures."""
-        return self.prepare(state.dtype).flow(state, cuts=False).supplied(_temperature(state))
+        return self.ready(state.dtype).flow(state, cuts=False).supplied(_temperature(state))
 
     def flow(self, state: State, cuts: bool) -> Flow:
         """What heats the nodes in this state; broken springs conduct nothing where `cuts`."""
@@ -229,23 +225,44 @@ class Heat(Rule):
                 "cut_by says that broken springs conduct nothing, but no spring of this state can break (its `alive` is None). Add the "
                 "rule that breaks springs, or pass cut_by=None."
             )
-        if not self.cut_by.owns(state.alive):
+        cuts = state.alive_of(self.cut_by)
+        if cuts is None:
+            other = fields_of(state.alive)[0]
             raise ValueError(
                 f"state.alive tells about other springs than those of cut_by ({self.cut_by.identity}): they are of "
-                f"{state.alive.identity or 'no known net'}, in families of shapes {tuple(entry.shape for entry in state.alive.families)}."
+                f"{other.identity or 'no known net'}, in families of shapes {tuple(entry.shape for entry in other.families)}."
             )
-        alive = EdgeField(tuple(state.alive.families[i] for i in self.families))
+        alive = EdgeField(tuple(cuts.families[i] for i in self.families))
         # `where`, since zero times a conductance that is not finite is not zero.
         return self.conductance.map(lambda g, is_whole: jnp.where(is_whole, g, jnp.zeros_like(g)), alive)
 
-    def prepare(self, dtype: Any) -> Heat:
-        """Capacity in node shape, conductance as an edge field, all of `dtype`."""
-        capacity = jnp.broadcast_to(self.capacity, self.net.node_shape)
+    def bind(self, scene: Scene) -> Heat:
+        """Capacity in node shape, conductance as an edge field."""
+        return self.ready(scene.dtype)
+
+    def ready(self, dtype: Any) -> Heat:
+        """The same, without a system: what `power`, `supplied` and `total_heat` read."""
+        if self.place is not None:
+            return self
+        capacity = jnp.broadcast_to(self.net.node_field(self.capacity, "capacity"), self.net.node_shape)
         conductance = self.net.edge_field(self.conductance, "conductance")
         if not isinstance(conductance, EdgeField):
             conductance = self.net.own(jnp.broadcast_to(conductance, shape) for shape in self.net.family_shapes)
-        ready = eqx.tree_at(lambda h: (h.capacity, h.conductance), self, (capacity, self.net.inside(conductance, 0)))
-        return cast_inexact(ready, dtype)
+        made = (capacity, self.net.inside(conductance, 0), *self._on_net())
+        places = eqx.tree_at(
+            lambda h: (h.capacity, h.conductance, h.boundaries, h.latent, h.source), self, made, is_leaf=lambda a: a is None
+        )
+        return cast_inexact(places, dtype)
+
+    def _on_net(self) -> tuple[tuple[ThermalBoundary, ...], LatentHeat | None, Any]:
+        """Boundaries, latent heat and source with their values as node arrays.
+
+        Raises:
+            ValueError: values or nodes of another net.
+        """
+        boundaries = tuple(b.on(self.net, f"boundaries[{i}]") for i, b in enumerate(self.boundaries))
+        source = self.source if self.source is None or callable(self.source) else self.net.node_field(self.source, "source")
+        return boundaries, None if self.latent is None else self.latent.on(self.net), source
 
     def invalid(self) -> Array:
         """Whether a constant has a value that the constructor would refuse."""
@@ -271,7 +288,7 @@ def total_heat(heat: Heat, state: State) -> Array:
     >>> print(total_heat(Heat(net, 2.0, 1.0), state))
     1800.0
     """
-    ready = heat.prepare(state.dtype)
+    ready = heat.ready(state.dtype)
     temperature = _temperature(state)
     total = jnp.sum(ready.capacity * temperature)
     if ready.latent is None:
@@ -305,7 +322,7 @@ def _conductance(net: Topology, value: Any) -> Any:
 def _source(net: Topology, value: Any) -> Array:
     value = as_inexact("source", value)
     finite("source", value)
-    return net.node_field(value, "source")
+    return value
 
 
 def _kind(name: str, value: Any, kind: type) -> Any:

@@ -17,35 +17,32 @@ Source: first law; the split of kicks is that of m (v''^2 - v^2) / 2 = (dt F + J
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..forces.base import Finding, Force, Rule, Step
-from ..forces.contact import Books, strike
+from ..forces.base import Force, Rule, Scene, Step
+from ..forces.contact import Books
 from ..forces.fluid import Fluid
-from ..numerics import cast_inexact
+from ..memory import entry_at
 from ..state import State
 from ..status import Status
-from ..topology.base import Topology
 from ..vector import Vector
 from .heat import Heat, total_heat
 
 
 class Account(eqx.Module):
-    """What a `Ledger` keeps in `state.ledger`; `energy_ledger` reads it.
+    """What a `Ledger` remembers; `energy_ledger` reads it.
 
     Attributes:
         start: (2 + F,) columns at the start [J]: kinetic, F forces, heat.
         now: the same now.
         work: (F,) work of drag and of forces without potential [J].
         motion: (2 + F,) what the columns changed by motion [J].
-        rules: (R, 2 + F) what each rule changed [J].
+        rules: (R, 2 + F) what each rule changed [J]; those that watch, such as a ledger, change nothing.
         impulses: (1 + R, D) momentum given by motion and by each rule [kg m/s].
     """
 
@@ -58,15 +55,12 @@ class Account(eqx.Module):
 
 
 class Ledger(Rule):
-    """Runs other rules, in their order, and books what they and the motion do to the energy. It takes their place in `System(rules=...)`.
+    """Books what the motion and every other rule do to the energy. It watches, and changes nothing.
 
     Attributes:
-        rules: heat, fusing, contact; may be empty.
-        forces: those of the system, which fills them in.
-        mass: [kg]; the system fills it in.
-
-    Raises:
-        TypeError: something that is not a rule.
+        forces: those of the system, once bound.
+        rules: those of the system, once bound.
+        mass: [kg], once bound.
 
     >>> import jaxspring as js
     >>> net = js.lattice(2)
@@ -77,94 +71,39 @@ class Ledger(Rule):
     ['end', 'impulses', 'integration', 'residual', 'rules', 'start', 'work'] True True
     """
 
-    rules: tuple[Rule, ...]
+    watches: ClassVar[bool] = True
     forces: tuple[Force, ...] | None
+    rules: tuple[Rule, ...] | None
     mass: Array | None
 
-    def __init__(self, rules: Rule | Sequence[Rule] = ()):
-        self.rules = (rules,) if isinstance(rules, Rule) else tuple(rules)
-        for i, rule in enumerate(self.rules):
-            if not isinstance(rule, Rule) or isinstance(rule, (Force, Ledger)):
-                raise TypeError(f"rules[{i}] is a {type(rule).__name__}; expected a rule, e.g. Heat(net, ...), and no second Ledger.")
-        self.forces = None
-        self.mass = None
+    def __init__(self) -> None:
+        self.forces = self.rules = self.mass = None
 
-    @property
-    def net(self) -> Topology | None:
-        """The topology of the first rule that has one."""
-        return next((net for net in (getattr(r, "net", None) for r in self.rules) if net is not None), None)
+    def bind(self, scene: Scene) -> Ledger:
+        """The same, knowing masses, forces and rules of the scene."""
+        first = len(scene.forces)
+        forces = tuple(scene.bound(i) for i in range(first))
+        rules = tuple(rule if rule.watches else scene.bound(first + i) for i, rule in enumerate(scene.rules))
+        known = (forces, rules, scene.mass)
+        return eqx.tree_at(lambda r: (r.forces, r.rules, r.mass), self, known, is_leaf=lambda leaf: leaf is None)
 
-    @property
-    def obstacles(self) -> tuple[Rule, ...]:
-        """Those among its rules."""
-        return tuple(obstacle for rule in self.rules for obstacle in rule.obstacles)
-
-    @property
-    def sets_temperature(self) -> bool:
-        """Whether one of its rules does."""
-        return any(rule.sets_temperature for rule in self.rules)
-
-    def with_mass(self, mass: Array) -> Ledger:
-        """The same, knowing the masses [kg]."""
-        rules = tuple(r.with_mass(mass) for r in self.rules)
-        return eqx.tree_at(lambda r: (r.rules, r.mass), self, (rules, mass), is_leaf=lambda leaf: leaf is None)
-
-    def with_forces(self, forces: tuple[Force, ...]) -> Ledger:
-        """The same, knowing the forces."""
-        rules = tuple(r.with_forces(forces) for r in self.rules)
-        return eqx.tree_at(lambda r: (r.rules, r.forces), self, (rules, forces), is_leaf=lambda leaf: leaf is None)
-
-    def prepare(self, dtype: Any) -> Ledger:
-        """Every rule as the loop wants it."""
-        return cast_inexact(eqx.tree_at(lambda r: r.rules, self, tuple(r.prepare(dtype) for r in self.rules)), dtype)
-
-    def limit(self, state: State) -> Array | None:
-        """The smallest limit of its rules [s]."""
-        limits = [limit for limit in (r.limit(state) for r in self.rules) if limit is not None]
-        return None if not limits else jnp.min(jnp.stack(limits))
-
-    def diagnose(self, state: State) -> tuple[Finding, ...]:
-        """What its rules have to report."""
-        return tuple(finding for r in self.rules for finding in r.diagnose(state))
-
-    def invalid(self) -> Array | None:
-        """Whether a rule holds a constant that its constructor refuses."""
-        bad = [b for b in (r.invalid() for r in self.rules) if b is not None]
-        return None if not bad else jnp.any(jnp.stack(bad))
-
-    def begin(self, state: State) -> State:
-        """The state with what its rules need, and an account."""
-        for rule in self.rules:
-            state = rule.begin(state)
-        if state.ledger is not None:
-            return state
-        now = self.columns(state)
-        n = len(self._forces())
-        work, books = jnp.zeros(n, state.dtype), jnp.zeros((len(self.rules), n + 2), state.dtype)
-        account = Account(now, now, work, jnp.zeros_like(now), books, jnp.zeros((1 + len(self.rules), state.dim), state.dtype))
-        return dataclasses.replace(state, ledger=account)
+    def remember(self, state: State) -> Account:
+        """An account with nothing in it."""
+        forces, rules = self._parts()
+        now, (n, r) = self.columns(state), (len(forces), len(rules))
+        work, books = jnp.zeros(n, state.dtype), jnp.zeros((r, n + 2), state.dtype)
+        return Account(now, now, work, jnp.zeros_like(now), books, jnp.zeros((1 + r, state.dim), state.dtype))
 
     def update(self, step: Step, state: State) -> tuple[State, Status]:
-        """Every rule, with its entry: obstacles last, all of them together."""
-        account: Account = state.ledger
-        before, status = step.before, Status.ok()
-        stages, columns, places = [before, state], [account.now, self.columns(state)], [-1]
-        for i, rule in enumerate(self.rules):
-            if not rule.obstacles:
-                last = state
-                state, seen = rule.update(step, last)
-                status = status.then(seen)
-                stages.append(state)
-                columns.append(self.columns(state, last, columns[-1]))
-                places.append(i)
-        struck = None
-        if self.obstacles:
-            last = state
-            state, seen, struck = strike(self.obstacles, step, last, books=True)
-            status = status.then(seen)
-            stages.append(state)
-            columns.append(self.columns(state, last, columns[-1]))
-            places.append(-1)
+        """The state with the step in the books."""
+        account: Account = self.recall(state)
+        n_forces = len(self._parts()[0])
+        before = step.before
+        stages, columns, places = [before, step.moved], [account.now, self.columns(step.moved)], [-1]
+        for place, after in step.stages:
+            columns.append(self.columns(after, stages[-1], columns[-1]))
+            stages.append(after)
+            places.append(place - n_forces if place >= 0 else -1)
         mean = 0.5 * (before.velocity + state.velocity)
         books, momenta = jnp.zeros_like(account.rules), jnp.zeros_like(account.impulses)
         motion = jnp.zeros_like(account.motion)
@@ -172,16 +111,16 @@ class Ledger(Rule):
             change, given = self._change(a, b, mean, x, y), self._momentum(b) - self._momentum(a)
             momenta = momenta.at[1 + i].add(given)
             books, motion = (books, motion + change) if i < 0 else (books.at[i].add(change), motion)
-        if struck is not None:
-            books, motion, momenta = self._by_obstacle(state, struck, books, motion, momenta)
+        if step.impacts is not None:
+            books, motion, momenta = self._by_obstacle(state, step.impacts, books, motion, momenta)
         work = account.work + self._work(before, mean, step.dt)
         new = Account(account.start, columns[-1], work, account.motion + motion, account.rules + books, account.impulses + momenta)
-        return dataclasses.replace(state, ledger=new), status
+        return self.keep(state, new), Status.ok()
 
     def _by_obstacle(self, state: State, struck: Books, books: Array, motion: Array, momenta: Array) -> tuple[Array, Array, Array]:
         """The entries, where what each obstacle took of energy and gave of momentum is its own and no longer motion's."""
         mass, (work, given) = self._mass(state), struck
-        rows = [i for i, rule in enumerate(self.rules) if rule.obstacles]
+        rows = [i for i, rule in enumerate(self._parts()[1]) if rule.is_obstacle]
         for i, taken, velocity in zip(rows, work, given, strict=True):
             energy, momentum = jnp.sum(mass * taken), jnp.stack([jnp.sum(mass * a) for a in velocity])
             books, motion = books.at[i, 0].add(energy), motion.at[0].add(-energy)
@@ -201,19 +140,19 @@ class Ledger(Rule):
         zero = jnp.zeros((), state.dtype)
         is_moved = last is None or known is None or last.position is not state.position or last.alive is not state.alive
         stored = []
-        for i, force in enumerate(self._forces()):
+        for i, force in enumerate(self._parts()[0]):
             energy = force.energy(state) if is_moved or known is None or not isinstance(force, Fluid) else known[1 + i]
             stored.append(zero if energy is None else energy)
-        heat = sum((total_heat(r, state) for r in self.rules if isinstance(r, Heat)), start=zero)
+        heat = sum((total_heat(r, state) for r in self._parts()[1] if isinstance(r, Heat)), start=zero)
         return jnp.stack([kinetic, *stored, heat])
 
     def _work(self, before: State, mean: Vector, dt: Array) -> Array:
         """(F,) work of drag and of forces without potential in one step at this mean velocity [J]."""
         still = before.moved(before.position, Vector.zeros_like(before.velocity))
         parts = []
-        for force in self._forces():
-            has_potential = force.energy(before) is not None
-            if has_potential and force.is_symmetric(before) and force.damping_bound(before) is None:
+        for force in self._parts()[0]:
+            has_potential = force.has_potential
+            if has_potential and force.is_symmetric and force.damping_bound(before) is None:
                 parts.append(jnp.zeros((), before.dtype))
                 continue
             f = force.force(before)
@@ -225,22 +164,23 @@ class Ledger(Rule):
         mass = self._mass(state)
         return jnp.stack([jnp.sum(mass * a) for a in state.velocity])
 
-    def _forces(self) -> tuple[Force, ...]:
-        if self.forces is None:
-            raise ValueError("Ledger knows no forces yet. Put it in System(rules=...), and call rollout, or system.prepare(dtype).")
-        return self.forces
+    def _parts(self) -> tuple[tuple[Force, ...], tuple[Rule, ...]]:
+        if self.forces is None or self.rules is None:
+            raise ValueError("Ledger knows no forces yet. Put it in System(rules=...), and call rollout, or system.bind(state.dtype).")
+        return self.forces, self.rules
 
     def _mass(self, state: State) -> Array:
-        self._forces()
+        self._parts()
         return jnp.asarray(self.mass, state.dtype)
 
 
-def energy_ledger(system: Any, state: State) -> dict[str, Any]:
+def energy_ledger(system: Any, state: State, which: int = 0) -> dict[str, Any]:
     """The books of a run as names and numbers; for the host.
 
     Args:
-        system: whose rule is a `Ledger`.
+        system: of whose rules one is a `Ledger`.
         state: the last of a rollout.
+        which: the ledger that is meant, where there are several.
 
     Returns:
         `start`, `end`: energy by column [J]. `work`: of drag and forces without potential [J]. `rules`: what each rule changed, by column
@@ -250,11 +190,12 @@ def energy_ledger(system: Any, state: State) -> dict[str, Any]:
     Raises:
         ValueError: no ledger in the system, or none in the state.
     """
-    ledger = next((rule for rule in system.rules or () if isinstance(rule, Ledger)), None)
-    if ledger is None or not isinstance(state.ledger, Account):
-        raise ValueError("there is no ledger. Pass rules=Ledger(rules) to System, and a state that came out of rollout.")
-    account = state.ledger
-    forces, rules = _names(system.forces), _names(ledger.rules)
+    places = [i for i, part in enumerate(system.parts) if isinstance(part, Ledger)]
+    entry = entry_at(state.memory, places[which]) if which < len(places) else None
+    if entry is None or not isinstance(entry.value, Account):
+        raise ValueError("there is no ledger. Pass rules=(..., Ledger()) to System, and a state that came out of rollout.")
+    account = entry.value
+    forces, rules = _names(system.forces), _names(system.rules)
     columns = ("kinetic", *forces, "heat")
     start, now, work, motion, books = (
         np.asarray(a, np.float64) for a in (account.start, account.now, account.work, account.motion, account.rules)
@@ -268,10 +209,14 @@ def energy_ledger(system: Any, state: State) -> dict[str, Any]:
         "start": named(start),
         "end": named(now),
         "work": dict(zip(forces, map(float, work), strict=True)),
-        "rules": {name: named(row) for name, row in zip(rules, books, strict=True)},
+        "rules": {name: named(row) for name, row in zip(rules, books, strict=True) if not name.startswith("Ledger")},
         "integration": integration,
         "residual": float(np.sum(now - start) - np.sum(work) - integration - np.sum(books)),
-        "impulses": dict(zip(("motion", *rules), np.asarray(account.impulses, np.float64).tolist(), strict=True)),
+        "impulses": {
+            name: row
+            for name, row in zip(("motion", *rules), np.asarray(account.impulses, np.float64).tolist(), strict=True)
+            if not name.startswith("Ledger")
+        },
     }
 
 

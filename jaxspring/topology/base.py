@@ -148,6 +148,29 @@ class Topology(eqx.Module):
         """
         return dataclasses.replace(self, name=name)
 
+    def with_edges(self, edges: Any, name: str | None = None) -> Topology:
+        """A further net over the same nodes, with springs of its own: bending springs, a seam, another graph.
+
+        Its springs have constants, damping and breaking of their own; what it costs grows with the nodes that it touches.
+
+        Args:
+            edges: (E, 2) tail and head node of each spring, in the user's numbering of this net's nodes.
+            name: tells it from another net of the same springs.
+
+        Raises:
+            ValueError: a node that does not exist, a spring that joins a node to itself.
+
+        >>> import jaxspring as js
+        >>> sheet = js.lattice((2, 3))
+        >>> seam = sheet.with_edges([(0, 5), (3, 2)])
+        >>> system = js.System(sheet, 1.0, (js.Springs(sheet, 10.0, 1.0), js.Springs(seam, 2.0, 1.0)))
+        >>> print(seam.lengths(sheet.grid()).round(2))
+        [2.24 2.24]
+        """
+        from .overlay import Overlay
+
+        return Overlay.on(self, edges, name)
+
     def owns(self, field: EdgeField) -> bool:
         """Whether an edge field tells about the springs of this net. One made by hand does not say, and is taken by its shapes."""
         if field.identity is not None:

@@ -104,5 +104,28 @@ def _common_identity(*fields: EdgeField) -> NetIdentity | None:
     return known[0] if known else None
 
 
+# Fields of several nets over the same nodes, or of one.
+OfNets: TypeAlias = "EdgeField | tuple[EdgeField, ...] | None"
+
+
+def fields_of(fields: OfNets) -> tuple[EdgeField, ...]:
+    """As a tuple, whatever their number."""
+    return () if fields is None else (fields,) if isinstance(fields, EdgeField) else fields
+
+
+def field_of(net: Any, fields: OfNets) -> EdgeField | None:
+    """The one that tells about the springs of this net, or None."""
+    return next((field for field in fields_of(fields) if net.owns(field)), None)
+
+
+def with_field(net: Any, fields: OfNets, field: EdgeField) -> OfNets:
+    """The fields, where this one takes the place of the net's old one, or comes last."""
+    others = fields_of(fields)
+    if all(not net.owns(other) for other in others):
+        others = (*others, field)
+    new = tuple(field if net.owns(other) else other for other in others)
+    return new[0] if len(new) == 1 else new
+
+
 class ZeroOutside(EdgeField):
     """An edge field that is zero where a lattice keeps places of springs that do not exist; arithmetic gives a plain `EdgeField`."""

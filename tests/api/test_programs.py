@@ -111,7 +111,7 @@ def library_step(*effects, dim=2):
     def step(system, state, dt):
         return js.SymplecticEuler().step(system, state, dt, None)[0]
 
-    return jax.jit(step).lower(system.prepare(state.dtype), state, jnp.asarray(1e-2))
+    return jax.jit(step).lower(system.bind(state.dtype), state, jnp.asarray(1e-2))
 
 
 def minimal(*shapes):
@@ -174,7 +174,7 @@ def test_a_rollout_adds_the_statuses_alone():
 
 def force_alone(effect, dim):
     state = js.State.from_points(CHAIN, np.zeros((N, dim)))
-    ready = js.System(CHAIN, 1.0, effect).prepare(state.dtype)
+    ready = js.System(CHAIN, 1.0, effect).bind(state.dtype)
     return jax.jit(lambda system, state: system.forces[0].force(state)).lower(ready, state)
 
 

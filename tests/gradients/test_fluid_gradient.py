@@ -17,9 +17,8 @@ CHOICES = pytest.mark.parametrize("pairs", [js.AllPairs(tile=5), js.NeighbourLis
 def fluid_of(pairs, rng, n=20):
     """A short-ranged fluid with its list begun, a direction to move in and one to weigh the forces with."""
     system, state = make(blob(rng, n), rng.uniform(0.5, 2, n), cutoff=js.ShiftedForce(2.5), pairs=pairs)
-    system = system.prepare(state.dtype)
     along, weights = (js.Vector(tuple(jnp.asarray(rng.normal(size=n)) for _ in range(3))) for _ in range(2))
-    return system, jax.jit(lambda s: system.begin(s))(state), along, weights
+    return system.bind(state.dtype), jax.jit(lambda s: system.begin(s))(state), along, weights
 
 
 def dot(a, b):
@@ -95,8 +94,9 @@ def test_derivatives_by_everything(pairs, rng):
     def force(at):
         position, velocity, mass, alpha, zeta, damping, radius = at
         drag, law = js.PairDrag(damping, radius), js.SlideLaw(alpha, 1.0, zeta)
-        fluid = js.Fluid(law, js.ShiftedForce(2.5), pairs, drag, molten=js.Molten(net)).with_mass(mass)
-        return fluid.force(fluid.begin(start.moved(position, velocity)))
+        fluid = js.Fluid(law, js.ShiftedForce(2.5), pairs, drag, molten=js.Molten(net))
+        system = js.System(net, mass, fluid)
+        return system.force(system.begin(start.moved(position, velocity)))
 
     at = (start.position, start.velocity, jnp.asarray(rng.uniform(0.5, 2, n)), *(jnp.asarray(a) for a in (1.0, 0.1, 0.7, 2.2)))
     ways = jax.tree.map(lambda a: jnp.asarray(rng.normal(size=a.shape)), at)

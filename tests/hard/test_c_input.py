@@ -93,7 +93,7 @@ def test_b6_a_squeezed_cloth():
     start = js.State.from_points(net, 0.6 * flat + 1e-3 * np.random.default_rng(3).normal(size=flat.shape))
 
     def eigenvalues(kind):
-        blocks = system.prepare(start.dtype).stiffness_blocks(start, kind)
+        blocks = system.bind(start.dtype).stiffness_blocks(start, kind)
         return np.linalg.eigvalsh(np.asarray(system.matrix(blocks, start).to_dense()))
 
     assert eigenvalues(js.ExactTangent())[0] < -1e4
@@ -111,7 +111,7 @@ def test_c9_a_free_chain_at_rest(solver):
     """K x = f on a free 10-chain: balanced forces are solved, a net force is an error, nothing gives zeros without an iteration."""
     net = js.lattice(10)
     start = js.State.from_points(net, net.grid())
-    system = js.System(net, 1.0, js.Springs(net, 1.0, 1.0)).prepare(start.dtype)
+    system = js.System(net, 1.0, js.Springs(net, 1.0, 1.0)).bind(start.dtype)
     matrix = system.matrix(system.stiffness_blocks(start, js.Tangent()), start)
 
     def solve(f):

@@ -168,7 +168,7 @@ def test_d8_dot_test(rng, stepper, kind, dtype):
 
     def step(inputs):
         x, v, k, l, mass, gamma, dt = inputs
-        system = js.System(net, mass, (js.Springs(net, k, l), js.Drag(gamma))).prepare(x.dtype)
+        system = js.System(net, mass, (js.Springs(net, k, l), js.Drag(gamma))).bind(x.dtype)
         state = js.State.from_points(net, x, v)
         end, memory = stepper.step(system, state, dt, stepper.init(system, state))
         return end.position, end.velocity, memory

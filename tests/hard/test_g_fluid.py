@@ -13,7 +13,7 @@ OVERLAP, DT_LIMIT, OVERFLOW = js.Flag.OVERLAP, js.Flag.DT_LIMIT, js.Flag.NEIGHBO
 
 def found(system, state):
     """What the fluid reports of a state: flag -> count."""
-    fluid = system.prepare(state.dtype).forces[0]
+    fluid = system.bind(state.dtype).forces[0]
     return {finding.flag: int(finding.count) for finding in fluid.diagnose(state)}
 
 
@@ -159,12 +159,12 @@ def test_g7_a_list_too_small_says_what_it_needs(rng):
     cut = js.ShiftedForce(2.0)
     system, state = make(points, cutoff=cut, pairs=js.NeighbourList(capacity=32, skin=0.3))
     assert needed > 32
-    counted = found(system, system.prepare(state.dtype).begin(state))[OVERFLOW]
+    counted = found(system, system.bind(state.dtype).begin(state))[OVERFLOW]
     assert counted >= needed
     everyone, _ = make(points, cutoff=cut)
     np.testing.assert_allclose(components(system.force(state)), components(everyone.force(state)), rtol=1e-12, atol=1e-12)
     enough, _ = make(points, cutoff=cut, pairs=js.NeighbourList(capacity=int(counted), skin=0.3))
-    assert found(enough, enough.prepare(state.dtype).begin(state))[OVERFLOW] == 0
+    assert found(enough, enough.bind(state.dtype).begin(state))[OVERFLOW] == 0
 
 
 @pytest.mark.slow
@@ -210,9 +210,9 @@ def test_g10_list_equals_all_pairs(dim, dtype, rng):
 
     @jax.jit
     def both(state):
-        begun = listed.prepare(state.dtype).begin(state)
-        fluid = listed.prepare(state.dtype).forces[0]
-        return (fluid.force(begun), fluid.energy(begun), begun.neighbours.near.needed), (
+        begun = listed.bind(state.dtype).begin(state)
+        fluid = listed.bind(state.dtype).forces[0]
+        return (fluid.force(begun), fluid.energy(begun), begun.memory[0].value.near.needed), (
             everyone.force(state),
             everyone.energy(state).total,
         )

@@ -209,7 +209,7 @@ def test_numbers_by_family():
         lambda s: s.force(state),
         lambda s: s.energy(state),
         lambda s: s.stiffness_bound(state),
-        lambda s: s.prepare(jnp.float64).force(state),
+        lambda s: s.bind(jnp.float64).force(state),
         lambda s: s.rounding(state),
         lambda s: SHEET.flatten(s.tension(state)),
         lambda s: s.invalid(),
@@ -218,7 +218,7 @@ def test_numbers_by_family():
             np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-15)
     np.testing.assert_array_equal(SHEET.flatten(short.stiffness), written)
     for make in (lambda c: js.Dashpots(SHEET, c), lambda c: js.Heat(SHEET, 1.0, c)):
-        a, b = (jax.tree.leaves(make(c).prepare(jnp.float64)) for c in (BY_FAMILY, written))
+        a, b = (jax.tree.leaves(make(c).bind(jnp.float64)) for c in (BY_FAMILY, written))
         for one, other in zip(a[-4:], b[-4:], strict=True):
             assert one.shape == other.shape
 

@@ -380,14 +380,13 @@ def test_what_an_adaptive_solver_cannot_honour_is_named():
     class Worn(js.Force):
         """Acts after steps."""
 
-        @property
-        def is_rule(self):
-            """It does."""
-            return True
-
         def force(self, state):
             """Nothing."""
             return js.Vector.zeros_like(state.position)
+
+        def update(self, step, state):
+            """It does."""
+            return state, js.Status.ok()
 
     for system in (
         js.System(net, 1.0, Worn()),

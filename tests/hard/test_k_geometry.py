@@ -222,7 +222,7 @@ def test_a_hot_fluid_crosses_the_walls(rng):
         np.testing.assert_allclose(system.momentum(result.state), 0, atol=1e-10)
     assert np.sum(np.floor(np.asarray(ends[0].points) / box) != np.floor(points / box)) > 20
     np.testing.assert_allclose(ends[1].points, ends[0].points, atol=1e-8)
-    assert 2 <= int(ends[1].neighbours.rebuilds) <= 150
+    assert 2 <= int(ends[1].memory[0].value.rebuilds) <= 150
 
 
 @pytest.mark.slow

@@ -176,7 +176,7 @@ def test_k8_fusing_breaks_the_springs_of_its_own_net(other):
         system = js.System(ONE, 1.0, (own, others), rules=js.Fusing(net, melting=350.0))
         start = system.begin(js.State.from_points(ONE, LINE, temperature=HOT))
         whole = start
-        end, _ = system.follow(start, start, jnp.asarray(0.1))
+        end, _ = system.bind(start.dtype).follow(start, start, jnp.asarray(0.1))
         assert not net.flatten(end.alive).all()
         broken = ~np.asarray(net.flatten(end.alive))
         tension = np.asarray(net.flatten(mine.tension(end)))
@@ -195,7 +195,7 @@ def test_k8_two_nets_cannot_both_fuse():
     with pytest.raises(ValueError, match=r"another net than Fusing: .*'bending'"):
         system.begin(js.State.from_points(ONE, LINE, temperature=HOT))
     with pytest.raises(ValueError, match=r"(?s)Fusing has a Graph of 3 springs .*would tell about springs that nothing holds"):
-        js.System(ONE, 1.0, js.Springs(ONE, 1.0, 1.0), rules=js.Fusing(OTHER, 350.0)).prepare(np.dtype(float))
+        js.System(ONE, 1.0, js.Springs(ONE, 1.0, 1.0), rules=js.Fusing(OTHER, 350.0)).bind(np.dtype(float))
 
 
 def test_k8_a_field_made_by_hand_is_of_the_systems_net():

@@ -110,9 +110,3 @@ def test_constants_of_a_floor_may_be_traced(dtype):
     if dtype == np.float64:
         up, down = np.asarray(values)[4:].reshape(2, 2, 6).transpose(1, 0, 2)
         np.testing.assert_allclose(slopes[:2], (up - down) / (2 * h), rtol=1e-6, atol=1e-7)
-
-
-def test_a_ledger_holds_all_floors():
-    """Floors within a ledger and beside it would act apart, in an order: refused."""
-    with pytest.raises(ValueError, match="put all of them into the Ledger"):
-        js.System(NET, 1.0, rules=(js.Ledger(js.Floor(GROUND, UP)), js.Floor(GROUND, UP)))

@@ -129,7 +129,7 @@ def test_step_for_a_collision(law):
     # Per q_i q_j: 3 beta / r^4 where beta / (2 r^2) is the energy; 624 epsilon sigma^12 / r^14 where 4 epsilon (sigma / r)^12 is.
     k = 12 * energy**2 / 1.3 if isinstance(law, js.SlideLaw) else 624 * 0.7 / 0.9**2 * (energy / 2.8) ** (14 / 12)
     expected = 2 / np.sqrt(2 * charge * k / mass)
-    limit, node = system.prepare(state.dtype).forces[0].collision_dt(state)
+    limit, node = system.bind(state.dtype).forces[0].collision_dt(state)
     assert float(limit) == pytest.approx(expected.min(), rel=1e-12)
     assert int(node) == expected.argmin() == 1
 
@@ -137,7 +137,7 @@ def test_step_for_a_collision(law):
 def test_a_step_too_long_for_a_collision_is_told_in_both_directions():
     """DT_LIMIT above the limit of the speeds after the step, for dt above zero and below; nothing a hair below it."""
     system, state = make(np.array([[-2.0, 0.0], [2.0, 0.0]]), velocities=np.array([[1.0, 0.0], [-5.0, 0.0]]))
-    fluid = system.prepare(state.dtype).forces[0]
+    fluid = system.bind(state.dtype).forces[0]
     limit = float(fluid.collision_dt(state)[0])
     slow = state.moved(state.position, 0.1 * state.velocity)
     for before, after, share, is_told in ((slow, state, 1.01, True), (slow, state, 0.99, False), (state, slow, 1.01, False)):
@@ -319,8 +319,8 @@ def test_damping_bound_holds(rng):
         return jnp.linalg.eigvalsh(-jax.jacfwd(force)(flat))[-1]
 
     top = float(top_eigenvalue(jnp.zeros(36)))
-    fluid = system.prepare(state.dtype).forces[0]
+    fluid = system.bind(state.dtype).forces[0]
     bound = float(jnp.max(fluid.damping_bound(state)))
     assert top <= bound <= 3 * top
-    assert not fluid.is_symmetric(state)
-    assert not fluid.can_feed(state)
+    assert not fluid.is_symmetric
+    assert not fluid.can_feed

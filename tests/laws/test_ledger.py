@@ -14,7 +14,7 @@ def melting_sheet(dt, duration=0.4):
     along = js.lattice((3, 4))
     forces = (js.Springs(NET, js.ThermalStiffness(40.0, 310.0, 350.0), 0.9), js.Gravity((0.0, -6.0)), js.Drag(0.3))
     heat = js.Heat(along, 1.0, 1.0, boundaries=js.HotPlane(GROUND, UP, 500.0, 6.0, 1.0, reach=0.5))
-    system = js.System(NET, 1.0, forces, rules=js.Ledger((heat, js.Fusing(NET, 350.0), js.Floor(GROUND, UP, 0.2))))
+    system = js.System(NET, 1.0, forces, rules=(js.Ledger(), heat, js.Fusing(NET, 350.0), js.Floor(GROUND, UP, 0.2)))
     start = js.State.from_points(NET, NET.grid() + np.array([0.0, 0.02]), temperature=300.0)
     run = js.rollout(system, start, js.SymplecticEuler(), dt, round(duration / dt))
     js.raise_for_status(run)
@@ -63,7 +63,7 @@ def test_drag_is_the_work_of_drag():
 def resting_on_a_floor(height, dt=0.01, n_steps=100):
     """The books of one node of 2 kg that starts this high [m] over a floor, under 10 m/s^2."""
     net = js.lattice(1)
-    system = js.System(net, 2.0, js.Gravity((0.0, -10.0)), rules=js.Ledger(js.Floor(GROUND, UP)))
+    system = js.System(net, 2.0, js.Gravity((0.0, -10.0)), rules=(js.Floor(GROUND, UP), js.Ledger()))
     return js.energy_ledger(system, js.rollout(system, js.State.from_points(net, [[0.0, height]]), js.SymplecticEuler(), dt, n_steps).state)
 
 
@@ -100,7 +100,7 @@ def test_a_bounce_is_booked_as_what_it_takes():
     """Under Verlet a ball's bounces take m (e^2 - 1) w^2 / 2 each, nothing at e = 1, and the stepper adds nothing, to rounding."""
     net = js.lattice(1)
     for e in (1.0, 0.5):
-        system = js.System(net, 2.0, js.Gravity((0.0, -10.0)), rules=js.Ledger(js.Floor(GROUND, UP, restitution=e)))
+        system = js.System(net, 2.0, js.Gravity((0.0, -10.0)), rules=(js.Floor(GROUND, UP, restitution=e), js.Ledger()))
         run = js.rollout(system, js.State.from_points(net, [[0.0, 1.0]]), js.VelocityVerlet(), 0.01, 120)
         book = js.energy_ledger(system, run.state)
         n_bounces = 1 if e == 1 else 3  # at 0.447 s and, of e = 0.5, at 0.894 and 1.118 s; of e = 1 the next is at 1.342 s
@@ -113,7 +113,7 @@ def test_a_bounce_is_booked_as_what_it_takes():
 def test_two_floors_have_their_own_entries():
     """Between a floor and a roof each takes what its own impacts take; without weight the one that is met later is met more slowly."""
     net = js.lattice(1)
-    walls = js.Ledger((js.Floor(GROUND, UP, restitution=0.5), js.Floor((0.0, 1.0), (0.0, -1.0), restitution=0.9)))
+    walls = (js.Floor(GROUND, UP, restitution=0.5), js.Floor((0.0, 1.0), (0.0, -1.0), restitution=0.9), js.Ledger())
     system = js.System(net, 1.0, rules=walls)
     run = js.rollout(system, js.State.from_points(net, [[0.0, 0.5]], [[0.3, -2.0]]), js.SymplecticEuler(), 0.1, 15)
     book = js.energy_ledger(system, run.state)
@@ -125,14 +125,14 @@ def test_two_floors_have_their_own_entries():
 
 @pytest.mark.slow
 def test_a_ledger_changes_nothing():
-    """The rules within a ledger act in their order, to the last bit as without it: heat first, then what it melts, contact last."""
+    """The rules beside a ledger act in their order, to the last bit as without it: heat first, then what it melts, contact last."""
     start = js.State.from_points(NET, NET.grid() + np.array([0.0, 0.02]), temperature=300.0)
     frames = {}
     for has_books in (True, False):
         heat = js.Heat(js.lattice((3, 4)), 1.0, 1.0, boundaries=js.HotPlane(GROUND, UP, 500.0, 6.0, 1.0, reach=0.5))
         rules = (heat, js.Fusing(NET, 350.0), js.Floor(GROUND, UP, 0.2))
         forces = (js.Springs(NET, js.ThermalStiffness(40.0, 310.0, 350.0), 0.9), js.Gravity((0.0, -6.0)))
-        system = js.System(NET, 1.0, forces, rules=js.Ledger(rules) if has_books else rules)
+        system = js.System(NET, 1.0, forces, rules=(js.Ledger(), *rules) if has_books else rules)
         # Every step: in another order springs would fuse one step later.
         frames[has_books] = js.rollout(system, start, js.SymplecticEuler(), 2e-3, 200, save_every=1, observe=seen).saved
     for a, b in zip(frames[True], frames[False], strict=True):
@@ -148,7 +148,7 @@ def molten_pair(rule, drag=None, dt=1e-3, n_steps=1):
     """Two free particles and one on a spring that is heated above 350 K at once; the books, the system and the end."""
     net = js.Graph.from_edges(np.array([[2, 3]]), 4)
     fluid = js.Fluid(js.SlideLaw(1.0, 1.0), drag=drag, molten=js.Molten(net))
-    system = js.System(net, 1.0, (js.Springs(net, 10.0, 1.0), fluid), rules=js.Ledger(rule(net)))
+    system = js.System(net, 1.0, (js.Springs(net, 10.0, 1.0), fluid), rules=(rule(net), js.Ledger()))
     points = [[0.0, 0.0], [1.3, 0.0], [0.0, 0.8], [1.3, 0.9]]
     start = js.State.from_points(net, points, [[0.5, 0], [-0.5, 0], [0, 0.3], [0, 0]], temperature=400.0)
     end = js.rollout(system, start, js.SymplecticEuler(), dt, n_steps).state

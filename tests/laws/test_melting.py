@@ -162,7 +162,7 @@ def scene(latent, conductance):
     """An insulated sheet that softens, melts and tears while it swings, with a book of its energy."""
     heat = js.Heat(ALONG, 1.0, conductance, latent=js.LatentHeat(MELTING, latent), cut_by=NET)
     springs = js.Springs(NET, js.ThermalStiffness(FULL, 320.0, 370.0), NET.lengths(NET.grid()))
-    return js.System(NET, 1.0, (springs, js.Drag(0.3)), rules=js.Ledger((heat, js.Fusing(NET, MELTING))))
+    return js.System(NET, 1.0, (springs, js.Drag(0.3)), rules=(heat, js.Fusing(NET, MELTING), js.Ledger()))
 
 
 @jax.jit
@@ -171,7 +171,7 @@ def torn(points, velocities, temperatures, latent, conductance):
     system = scene(latent, conductance)
     start = js.State.from_points(NET, points, velocities, temperature=temperatures)
     run = js.rollout(system, start, js.SymplecticEuler(), 0.02, 20, save_every=1, observe=lambda s: jnp.sum(NET.flatten(s.alive)))
-    return system.prepare(start.dtype).begin(start), run.state, run.saved
+    return system.bind(start.dtype).begin(start), run.state, run.saved
 
 
 @pytest.mark.slow

@@ -153,7 +153,7 @@ def test_forces_that_are_given_and_precision(body):
     of_own, of_other = (s.force(state) - s.forces[0].force(state) for s in (own, of_soft))
     np.testing.assert_allclose(of_own.z, of_other.z, rtol=1e-12, atol=1e-14)
     single = js.State.from_points(net, flat.astype(np.float32), v.astype(np.float32))
-    assert own.force(single).dtype == own.prepare(np.float32).force(single).dtype == np.float32
+    assert own.force(single).dtype == own.bind(np.float32).force(single).dtype == np.float32
 
 
 def test_coefficients_from_two_ratios_and_wrong_ones():

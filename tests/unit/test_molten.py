@@ -41,7 +41,7 @@ def with_springs(net, state, alive):
 
 def force_of_fluid(system, state):
     """(N, D) forces of the fluid alone."""
-    return components(system.prepare(state.dtype).forces[1].force(state))
+    return components(system.bind(state.dtype).forces[1].force(state))
 
 
 def test_a_particle_is_fluid_when_its_last_spring_has_broken():
@@ -98,7 +98,7 @@ def test_energy_of_mixed_pairs_gives_their_force():
     """The gradient of the energy is minus the force, fluid and solid mixed, one of the pairs nearer than r_0."""
     net, system, state = scene()
     state = with_springs(net, state, [0, 0, 1, 1])
-    fluid = system.prepare(state.dtype).forces[1]
+    fluid = system.bind(state.dtype).forces[1]
     slope = jax.grad(lambda x: fluid.energy(state.moved(x, state.velocity)))(state.position)
     np.testing.assert_allclose(components(slope), -force_of_fluid(system, state), atol=1e-14)
 
@@ -109,7 +109,7 @@ def test_energy_of_a_mixed_pair_is_the_work_of_its_repulsion(r):
     core = 0.2
     net = js.Graph.from_edges(np.array([[1, 2]]), 3)
     # The solid particle's partner is far away, but no pair: both hang on one spring.
-    fluid = js.Fluid(js.SlideLaw(1.0, 1.0), core=core, molten=js.Molten(net)).with_mass(jnp.asarray(1.0))
+    fluid = js.System(net, 1.0, js.Fluid(js.SlideLaw(1.0, 1.0), core=core, molten=js.Molten(net))).bind(float).forces[0]
     state = js.State.from_points(net, [[0.0, 0.0], [r, 0.0], [99.0, 0.0]])
 
     def push(s):
@@ -126,7 +126,7 @@ def test_what_is_solid_drags_counts_and_limits_nothing():
     state = dataclasses.replace(state, velocity=js.State.from_points(net, state.points, speeds).velocity)
     # Only particle 0 is fluid: beside it 1 stands still, and 2 and 3 are nearer to each other than the core.
     at = with_springs(net, state, [0, 1, 1, 1])
-    fluid = system.prepare(state.dtype).forces[1]
+    fluid = system.bind(state.dtype).forces[1]
     still = at.moved(at.position, js.Vector.zeros_like(at.velocity))
     np.testing.assert_allclose(force_of_fluid(system, at), force_of_fluid(system, still), atol=1e-15)
     pulled = at.moved(at.position, js.State.from_points(net, state.points, speeds[[3, 0, 0, 0, 0]]).velocity)
@@ -149,7 +149,7 @@ def test_what_is_solid_drags_counts_and_limits_nothing():
 def test_bound_of_stiffness_of_a_mixed_pair():
     """Two particles, one fluid: twice the stiffness of the repulsion where it acts, zero beyond r_0."""
     net = js.Graph.from_edges(np.array([[1, 2]]), 3)
-    fluid = js.Fluid(js.SlideLaw(1.0, 1.0), molten=js.Molten(net)).with_mass(jnp.asarray(1.0))
+    fluid = js.System(net, 1.0, js.Fluid(js.SlideLaw(1.0, 1.0), molten=js.Molten(net))).bind(float).forces[0]
     for r, k in ((0.8, 3 / 0.8**4 - 1 / 0.8**2), (1.5, 0.0)):
         bound = fluid.stiffness_bound(js.State.from_points(net, [[0.0, 0.0], [r, 0.0], [99.0, 0.0]]))
         np.testing.assert_allclose(net.flatten_nodes(bound), [2 * k, 2 * k, 0], rtol=1e-12)
@@ -158,7 +158,7 @@ def test_bound_of_stiffness_of_a_mixed_pair():
 def test_no_pair_is_evaluated_before_something_melts():
     """The law is called for no tile while every spring is alive, and for each once one particle is free; so in a batch of scenes."""
     net, system, state = scene(CountedLaw(1.0, 1.0), pairs=js.AllPairs(tile=2))
-    fluid = system.prepare(state.dtype).forces[1]
+    fluid = system.bind(state.dtype).forces[1]
     force = jax.jit(lambda state: fluid.force(state))
 
     def count(function, *arguments):
@@ -195,7 +195,7 @@ def test_a_run_goes_through_no_pairs_before_something_melts():
     """
     net = js.lattice(5)
     fluid = js.Fluid(js.gentle_fluid(1.0), pairs=CountedPairs(), molten=js.Molten(net))
-    rules = js.Ledger((js.Heat(net, 1.0, 1.0), js.Fusing(net, 350.0)))
+    rules = (js.Heat(net, 1.0, 1.0), js.Fusing(net, 350.0), js.Ledger())
     system = js.System(net, 1.0, (js.Springs(net, 10.0, 1.0), fluid), rules=rules)
 
     def run(temperature):
@@ -276,10 +276,6 @@ LISTED = js.Fluid(js.SlideLaw(1.0, 1.0), js.PlainCutoff(2.0), js.NeighbourList(8
             lambda: js.Fluid(js.SlideLaw(1.0, 1.0), js.PlainCutoff(2.0), js.NeighbourList(8, 0.1), js.PairDrag(1.0, 2.5)),
             "drag.radius = 2.5 m is beyond the cut-off",
         ),
-        (
-            lambda: js.System(js.lattice(2), 1.0, (LISTED, LISTED)).prepare(float),
-            "two fluids of this system have a NeighbourList",
-        ),
     ],
 )
 def test_refusals(build, message):
@@ -302,8 +298,8 @@ def test_a_list_rests_until_something_melts():
         hot = dataclasses.replace(cold, temperature=jnp.asarray([400.0, 400.0, 400.0, 300.0, 300.0]))
         found.append((cold, js.rollout(system, hot, js.SymplecticEuler(), 0.01, 40).state))
     (_, everyone), (cold, listed) = found
-    assert int(cold.neighbours.rebuilds) == 0
-    assert int(listed.neighbours.rebuilds) > 0
+    assert int(cold.memory[1].value.rebuilds) == 0
+    assert int(listed.memory[1].value.rebuilds) > 0
     np.testing.assert_allclose(listed.points, everyone.points, rtol=1e-13)
 
 

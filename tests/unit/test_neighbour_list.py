@@ -48,7 +48,7 @@ def test_the_list_is_remade_when_it_must_and_no_pair_is_missed(rng):
         ends.append(js.rollout(system, state, js.VelocityVerlet(), 4e-3, 100))
     assert int(ends[1].status.flags) == 0
     np.testing.assert_allclose(ends[1].state.points, ends[0].state.points, atol=1e-9)
-    assert 3 <= int(ends[1].state.neighbours.rebuilds) <= 50
+    assert 3 <= int(ends[1].state.memory[0].value.rebuilds) <= 50
 
 
 @pytest.mark.slow
@@ -57,8 +57,8 @@ def test_a_step_beyond_the_skin_is_told(rng):
     system, state = make(
         blob(rng, 8, spacing=3.0), velocities=np.eye(8, 3) * 9.0, cutoff=js.ShiftedForce(2.5), pairs=js.NeighbourList(8, 0.1)
     )
-    fluid = system.prepare(state.dtype).forces[0]
-    begun = fluid.begin(state)
+    fluid = system.bind(state.dtype).forces[0]
+    begun = system.begin(state)
     update = jax.jit(lambda a, b: fluid.update(Step(a, b, jnp.asarray(1e-6)), b)[1].flags)
     for share, flag in ((1.05, js.Flag.DT_LIMIT), (0.95, 0)):
         after = begun.moved(begun.position + share * 0.05 / 9.0 * begun.velocity, begun.velocity)
@@ -97,8 +97,8 @@ def test_forces_wherever_particles_are(gap):
 def test_every_step_tells_an_overflow(rng):
     """The step itself says NEIGHBOUR_OVERFLOW with the capacity that is needed, whatever the list holds when the run ends."""
     system, state = make(blob(rng, 60, spacing=0.8), cutoff=js.ShiftedForce(2.5), pairs=js.NeighbourList(8, 0.3))
-    fluid = system.prepare(state.dtype).forces[0]
-    begun = fluid.begin(state)
+    fluid = system.bind(state.dtype).forces[0]
+    begun = system.begin(state)
     status = jax.jit(lambda state: fluid.update(Step(state, state, jnp.asarray(1e-6)), state)[1])(begun)
     assert int(status.flags) == int(js.Flag.NEIGHBOUR_OVERFLOW)
     (count,) = (int(found.count) for found in fluid.diagnose(begun) if found.flag == js.Flag.NEIGHBOUR_OVERFLOW)
@@ -153,7 +153,7 @@ def test_a_list_of_other_positions_is_not_used(rng):
     fresh = fresh.moved(fresh.position, moved.velocity)
     ends = [js.rollout(system, start, js.VelocityVerlet(), 1e-3, 5) for start in (moved, fresh)]
     np.testing.assert_allclose(ends[0].state.points, ends[1].state.points, atol=1e-12)
-    assert int(ends[0].state.neighbours.rebuilds) == int(ends[1].state.neighbours.rebuilds)
+    assert int(ends[0].state.memory[0].value.rebuilds) == int(ends[1].state.memory[0].value.rebuilds)
 
 
 @pytest.mark.slow
@@ -174,7 +174,7 @@ def test_a_list_that_serves_is_kept(rng):
     system, state = crystal(rng)
     first = js.rollout(system, state, js.VelocityVerlet(), 1e-3, 2).state
     second = js.rollout(system, first, js.VelocityVerlet(), 1e-3, 2).state
-    np.testing.assert_array_equal(second.neighbours.reference, state.position.components)
+    np.testing.assert_array_equal(second.memory[0].value.reference, state.position.components)
 
 
 @pytest.mark.slow

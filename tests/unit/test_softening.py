@@ -157,12 +157,12 @@ WHOLE_SHEET = js.EdgeField(tuple(jnp.ones(shape, bool) for shape in SHEET.family
         (lambda: js.Floor((0.0, 0.0), (0.0, 1.0), friction=-0.1), "friction"),
         (lambda: js.Floor((0.0, 0.0), (0.0, 1.0), restitution=1.5), "restitution"),
         (
-            lambda: js.System(CHAIN, 1.0, rules=js.Fusing(CHAIN, 1.0, js.Refreezing(1.0, 1.0))).prepare(float),
+            lambda: js.System(CHAIN, 1.0, rules=js.Fusing(CHAIN, 1.0, js.Refreezing(1.0, 1.0))).bind(float),
             "one Springs on the net of Fusing, whose rest lengths change; this system has 0",
         ),
         (lambda: js.Fusing(CHAIN, 1.0).begin(dataclasses.replace(warm(CHAIN, 1.0), alive=WHOLE_SHEET)), "of another net than Fusing"),
         (
-            lambda: js.System(SHEET, 1.0, js.Springs(SHEET, 1.0, 1.0), rules=js.Ledger(js.Fusing(BARE, 1.0))).prepare(float),
+            lambda: js.System(SHEET, 1.0, js.Springs(SHEET, 1.0, 1.0), rules=(js.Fusing(BARE, 1.0), js.Ledger())).bind(float),
             r"Fusing has a Lattice of \d+ springs .* Springs of this system have a Lattice of \d+ springs",
         ),
         (lambda: js.System(CHAIN, 1.0, rules=js.Fusing(CHAIN, 1.0)).begin(js.State.from_points(CHAIN, CHAIN.grid())), "from_points"),
@@ -180,7 +180,7 @@ def test_fusing_beside_springs_of_other_nets():
     system = js.System(SHEET, 1.0, beside, rules=js.Fusing(BARE, 350.0))
     end = js.rollout(system, warm(SHEET, 400.0), js.Still(), 0.1, 1).state
     assert not BARE.flatten(end.alive).any()
-    js.System(BARE, 1.0, js.Drag(1.0), rules=js.Fusing(BARE, 350.0)).prepare(float)
+    js.System(BARE, 1.0, js.Drag(1.0), rules=js.Fusing(BARE, 350.0)).bind(float)
 
 
 # Compiled: one operation at a time it takes seconds.

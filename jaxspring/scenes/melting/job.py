@@ -25,7 +25,7 @@ from ...state import State
 from ...status import Status
 from ...steppers.explicit import SymplecticEuler
 from ...thermal.fusing import melted_fraction
-from ...thermal.ledger import Ledger, energy_ledger
+from ...thermal.ledger import energy_ledger
 from ..drawing import canvas_and_figure
 from .pictures import draw_animation, draw_strip
 from .scene import Melting, MeltSettings, melting_block
@@ -99,7 +99,7 @@ class MeltRun:
         self.every = math.ceil(settings.n_steps / FRAMES)
         self.dt = settings.duration / (self.every * self.n_frames)  # so that equal frames fill the duration
         self.part = 3 if self.n_frames == FRAMES else 1
-        self.state = scene.system.prepare(scene.state.dtype).begin(scene.state)
+        self.state = scene.system.bind(scene.state.dtype).begin(scene.state)
         self.status, self.effects = Status.ok(), ()
         self.frames = jax.tree.map(lambda a: np.asarray(a)[None], _Look(scene.net)(self.state))
 
@@ -217,13 +217,12 @@ def exchanged(book: dict[str, Any]) -> float:
 
 def seconds_per_effect(scene: Melting, end: State, repeats: int = 10) -> dict[str, float]:
     """Seconds of one evaluation of each force and rule at the end of the run, compiled, the fastest of a few [s]."""
-    ready = scene.system.prepare(end.dtype)
-    rules = tuple(rule for book in ready.rules or () if isinstance(book, Ledger) for rule in book.rules)
+    ready = scene.system.bind(end.dtype)
     dt = jax.numpy.zeros((), end.dtype)
     found = {}
     for force in ready.forces:
         found[type(force).__name__] = _fastest(eqx.filter_jit(lambda f, s: f.force(s)), (force, end), repeats)
-    for rule in rules:
+    for rule in (r for r in ready.rules or () if not r.watches):
         found[type(rule).__name__] = _fastest(eqx.filter_jit(lambda r, s: r.update(Step(s, s, dt), s)), (rule, end), repeats)
     return found
 

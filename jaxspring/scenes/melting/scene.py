@@ -169,7 +169,7 @@ def melting_block(settings: MeltSettings | None = None, dtype: jnp.dtype | None 
         conductances(along, s.conductivity, s.spacing),
         boundaries=plate,
     )
-    rules = Ledger((heat, Fusing(net, s.melting), Floor(ground, up, s.friction)))
+    rules = (heat, Fusing(net, s.melting), Floor(ground, up, s.friction), Ledger())
     system = System(net, mass, (springs, Gravity((0.0, 0.0, -s.gravity)), Drag(s.drag), fluid), rules=rules)
     start = State.from_points(net, points, temperature=jnp.asarray(s.start, dtype))
     return Melting(net, system, start, heat)

@@ -137,7 +137,7 @@ class Reconstruction(eqx.Module):
 
         Returns the last stiffness (E,) [N/m] and the mesh that it acts on. n_updates times `relaxation.n_steps` steps in all.
         """
-        rule = rule.prepare(self.net, self.rest.dtype)
+        rule = rule.bind(self.net, self.rest.dtype)
 
         def stiffness(state: State) -> Array:
             return self.net.flatten(rule.stiffness(self.net, state))

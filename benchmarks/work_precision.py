@@ -73,7 +73,7 @@ class Method:
 def with_stepper(scene: Scene, stepper: Any, constant: Any, setting: Any) -> tuple[js.Vector, jax.Array, jax.Array]:
     """A loop of rollouts; setting is (dt, number of blocks)."""
     dt, n_blocks = setting
-    system = scene.system(constant).bind(scene.start.dtype)
+    system = scene.system(constant)
     first = js.rollout(system, scene.start, stepper, dt, 0)
 
     def block(_: Any, carry: Any) -> Any:

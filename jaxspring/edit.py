@@ -129,7 +129,7 @@ def _with(thing: Any, changes: dict[Path, Any]) -> Any:
     own: dict[Any, Any] = {path[0]: value for path, value in changes.items() if len(path) == 1}
     for key in dict.fromkeys(path[0] for path in changes if len(path) > 1):
         inner = {path[1:]: value for path, value in changes.items() if path[0] == key and len(path) > 1}
-        own[key] = _with(thing[key] if isinstance(thing, tuple) else getattr(thing, str(key)), inner)
+        own[key] = _with(thing[int(key)] if isinstance(thing, tuple) else getattr(thing, str(key)), inner)
     if isinstance(thing, tuple):
         return tuple(own.get(i, value) for i, value in enumerate(thing))
     return _rebuilt(thing, own)

@@ -17,11 +17,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from .archive import CheckpointError, Path, read_archive, write_archive
+from .memory import without_caches
+from .numbering import inward, outward
 from .state import State
 from .topology.base import Topology
 from .topology.edge_field import EdgeField
 
 PyTree = Any
+FORM = 2
 
 
 def save(path: Path, tree: PyTree) -> None:
@@ -42,7 +45,9 @@ def save(path: Path, tree: PyTree) -> None:
     ...     print(load(folder + "/two.npz", like={"stiffness": 0.0}))
     {'stiffness': 3.0}
     """
-    write_archive(path, named_arrays(tree), {"kind": "tree", "topologies": topologies(tree), "edge_fields": edge_fields(tree)})
+    tree = without_caches(tree)
+    about = {"kind": "tree", "form": FORM, "topologies": topologies(tree), "edge_fields": edge_fields(tree)}
+    write_archive(path, named_arrays(tree), about)
 
 
 def load(path: Path, like: PyTree = None) -> PyTree:
@@ -62,7 +67,7 @@ def load(path: Path, like: PyTree = None) -> PyTree:
         return archive.arrays
     expect_same(path, "topology", archive.about.get("topologies"), topologies(like))
     expect_same_springs(path, archive.about.get("edge_fields", {}), edge_fields(like))
-    return restored(path, archive.arrays, like)
+    return restored(path, archive.arrays, without_caches(like), archive.about.get("form", 1))
 
 
 def save_trajectory(path: Path, states: State, net: Topology | None = None) -> None:
@@ -93,9 +98,9 @@ def leaf_name(path: tuple[Any, ...]) -> str:
 
 
 def named_arrays(tree: PyTree) -> dict[str, np.ndarray]:
-    """Every array or number in a tree under its name, on the host."""
+    """Every array or number in a tree under its name, on the host, in the user's order of nodes and springs."""
     found: dict[str, np.ndarray] = {}
-    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+    for path, leaf in jax.tree_util.tree_leaves_with_path(outward(tree)):
         if not eqx.is_array_like(leaf) or isinstance(leaf, jax.ShapeDtypeStruct):
             continue
         name = leaf_name(path)
@@ -107,18 +112,46 @@ def named_arrays(tree: PyTree) -> dict[str, np.ndarray]:
     return found
 
 
-def restored(path: Path, arrays: Mapping[str, np.ndarray], like: PyTree) -> PyTree:
+def restored(path: Path, arrays: Mapping[str, np.ndarray], like: PyTree, form: int = FORM) -> PyTree:
     """`like` with its arrays and numbers replaced by those of the same name.
 
+    Args:
+        path: the file, for messages.
+        arrays: what it holds.
+        like: where they belong.
+        form: of the file: 1 where it does not say, with a graph's arrays in the graph's own order; 2 since they are in the user's.
+
     Raises:
-        CheckpointError: names, shapes or types differ.
+        CheckpointError: names, shapes or types differ; a file of an older form that holds what is kept otherwise now.
     """
+    if form < FORM:
+        arrays = _of_form_1(path, arrays, like)
     leaves, treedef = jax.tree_util.tree_flatten_with_path(like)
     wanted = {leaf_name(p) for p, leaf in leaves if _is_stored(leaf)}
     missing, unknown = sorted(wanted - set(arrays)), sorted(set(arrays) - wanted)
     if missing or unknown:
         complain(path, f"it lacks {missing[:5]} and has {unknown[:5]} that `like` does not know; expected {sorted(wanted)[:8]}")
-    return treedef.unflatten([_fitted(path, leaf_name(p), arrays, leaf) for p, leaf in leaves])
+    found = treedef.unflatten([_fitted(path, leaf_name(p), arrays, leaf) for p, leaf in leaves])
+    return found if form < FORM else inward(found)
+
+
+def _of_form_1(path: Path, arrays: Mapping[str, np.ndarray], like: PyTree) -> Mapping[str, np.ndarray]:
+    """The arrays of an older file, without the lists of neighbours that it holds.
+
+    Raises:
+        CheckpointError: the books of a ledger, which stood elsewhere; a heat on a graph, whose node arrays were in the graph's own order.
+    """
+    remedy = "load it with the jaxspring that wrote it, or run again"
+    kept = {name: a for name, a in arrays.items() if "neighbours" not in name.split("/")}
+    if any("ledger" in name.split("/") for name in kept):
+        complain(path, f"it is of form 1 and holds a ledger's books, which stand in state.memory since form {FORM}; {remedy}")
+    for heat in jax.tree.leaves(like, is_leaf=lambda leaf: hasattr(leaf, "conductance")):
+        net = getattr(heat, "net", None)
+        if hasattr(heat, "conductance") and isinstance(net, Topology) and net.node_permutation is not None:
+            complain(
+                path, f"it is of form 1 and holds a Heat on a graph, whose node values are in the user's order since form {FORM}; {remedy}"
+            )
+    return kept
 
 
 def topologies(tree: PyTree) -> dict[str, Any]:

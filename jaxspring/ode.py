@@ -26,7 +26,7 @@ from .forces.base import acts, remembers
 from .numerics import linear_call
 from .state import State
 from .status import Flag, Status
-from .system import System
+from .system import System, as_system
 from .vector import Vector
 from .watch import Carry, Precision, begin, look
 
@@ -137,6 +137,7 @@ def diffeqsolve(
     """
     import diffrax
 
+    system = as_system(system)
     _check_options(solver, saveat, stepsize_controller, adjoint, progress_meter, max_steps, event)
     _check_times(state.checked(), t1, dt0, may_be_infinite=event is not None)
     _check_parts(system)

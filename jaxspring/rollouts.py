@@ -35,7 +35,7 @@ from .state import State
 from .status import EXPLANATION, WARNINGS, Flag, StabilityWarning, Status
 from .steppers.base import Stepper
 from .steppers.stability import dt_limit
-from .system import System
+from .system import System, as_system
 from .watch import Carry, Precision, Solves, begin, inspect, settle
 
 
@@ -147,6 +147,7 @@ def rollout(
     >>> print(result.state.time)
     1.0
     """
+    system = as_system(system)
     _check_steps(n_steps, save_every, observe, check_every)
     dt = _checked_dt(dt, state, stepper)
     plan = make_plan(n_steps, save_every, Checkpointed() if adjoint is None else adjoint, check_every)

@@ -221,3 +221,12 @@ def _as_free(net: Topology, free: Any) -> Free:
         has_shape("free", free, {"per node": (net.n_nodes,), "per node and coordinate": (net.n_nodes, min(free.shape[1], 3))})
         return tuple(net.node_field(free[:, i], "free") for i in range(free.shape[1]))
     return net.node_field(free, "free")
+
+
+def as_system(value: Any) -> System:
+    """The system itself. TypeError for anything else, a bound system among them."""
+    if isinstance(value, BoundSystem):
+        raise TypeError("system is a BoundSystem, which a run makes for itself. Pass the System that it was bound from.")
+    if not isinstance(value, System):
+        raise TypeError(f"system is a {type(value).__name__}; expected a System: js.System(net, mass, forces).")
+    return value

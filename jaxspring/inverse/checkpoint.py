@@ -8,7 +8,7 @@ import equinox as eqx
 import numpy as np
 
 from ..archive import Path, read_archive, remove_leftovers, write_archive
-from ..files import complain, expect_same, named_arrays, restored, topologies
+from ..files import FORM, complain, expect_same, named_arrays, restored, topologies
 
 PyTree = Any
 PARTS = ("parameters", "best", "memory", "carried", "best_carried")
@@ -69,7 +69,7 @@ def write_checkpoint(place: Checkpoint, snapshot: Snapshot, identity: dict[str, 
     for part in PARTS:
         arrays |= {f"{part}/{name}": array for name, array in named_arrays(getattr(snapshot, part)).items()}
     arrays["next/loss"] = np.asarray(snapshot.history["loss"][snapshot.iteration], np.float64)
-    about = {"kind": "fit", "note": place.note, "best_iteration": snapshot.best_iteration} | identity
+    about = {"kind": "fit", "form": FORM, "note": place.note, "best_iteration": snapshot.best_iteration} | identity
     write_archive(place.path, arrays, about | {"topologies": topologies(snapshot.parameters)})
 
 
@@ -95,7 +95,8 @@ def read_checkpoint(place: Checkpoint, like: Snapshot, identity: dict[str, Any])
             complain(path, f"it holds {name!r}; expected only {', '.join(groups)}")
         groups[part][rest] = array
     expect_same(path, "history", sorted(groups["history"]), sorted(HISTORY))
-    parts = {part: restored(path, groups[part], getattr(like, part)) for part in PARTS}
+    form = archive.about.get("form", 1)
+    parts = {part: restored(path, groups[part], getattr(like, part), form) for part in PARTS}
     history = {name: groups["history"][name].tolist() for name in HISTORY}
     best_iteration = archive.about["best_iteration"]
     values = [parts[part] for part in PARTS]

@@ -34,7 +34,7 @@ from ..linalg.preconditioners import BlockJacobi, Preconditioner
 from ..numerics import stopped
 from ..state import State
 from ..status import Flag, Status
-from ..system import System
+from ..system import System, as_system
 from ..topology.periods import box_of
 from ..vector import Vector
 from .truncated import Ended, truncated_cg
@@ -105,7 +105,7 @@ def equilibrium(
     search = _Search(
         BlockJacobi() if preconditioner is None else preconditioner, ExactSolver() if adjoint is None else adjoint, tolerance, max_iter
     )
-    return _find(search, system, state.checked())
+    return _find(search, as_system(system), state.checked())
 
 
 class _Scene(eqx.Module):

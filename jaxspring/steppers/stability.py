@@ -18,7 +18,7 @@ from jaxtyping import Array
 
 from ..bound import BoundSystem
 from ..state import State
-from ..system import System
+from ..system import System, as_system
 from .base import Stepper
 from .explicit import SymplecticEuler
 
@@ -41,7 +41,7 @@ def stable_dt(system: System, state: State, stepper: Stepper | None = None) -> A
     2.0
     """
     stepper = SymplecticEuler() if stepper is None else stepper
-    limit = dt_limit(system.bind(state.checked().dtype), state, stepper)
+    limit = dt_limit(as_system(system).bind(state.checked().dtype), state, stepper)
     if limit is None:
         raise TypeError(f"{type(stepper).__name__} has no known stability limit (its `limit` returns None).")
     return limit

@@ -119,7 +119,9 @@ class Graph(Topology):
     @property
     def identity(self) -> NetIdentity:
         """The springs' digest, and the name."""
-        return NetIdentity("Graph", (f"{self.count} nodes", f"{self.springs.order.size} springs", f"digest {self.digest}"), self.name)
+        return NetIdentity(
+            "Graph", (f"{self.count} nodes", f"{self.springs.order.size} springs", f"digest {self.digest}"), self.name, self.springs
+        )
 
     @property
     def node_permutation(self) -> Permutation:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Hashable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+from .permutation import Permutation
 
 
 @dataclass(frozen=True)
@@ -18,11 +20,13 @@ class NetIdentity:
         kind: the class of the net.
         springs: all that the springs follow from.
         name: given by `net.named`, where there are several sets of springs along the same edges.
+        order: from the user's order of the springs to the one in which a graph keeps them, or None; it follows from the springs.
     """
 
     kind: str
     springs: tuple[Hashable, ...]
     name: str | None = None
+    order: Permutation | None = field(default=None, compare=False, repr=False)
 
     def has_springs_of(self, other: NetIdentity) -> bool:
         """Whether both have the same springs in the same order, whatever they are called."""

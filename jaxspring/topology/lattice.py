@@ -134,12 +134,15 @@ class Lattice(Topology):
         return eqx.tree_at(lambda net: net.box, self, None, is_leaf=lambda leaf: leaf is None)
 
     def difference(self, x: Vector) -> EdgeField:
-        """Head minus tail along each spring, by shifted slices."""
-        forward = partial(_difference, self.grid_shape)
-        backward = partial(_minus_accumulate, self.grid_shape)
-        columns = [linear_call(forward, backward, (), a) for a in x]
-        families = tuple(Vector(parts) for parts in zip(*columns, strict=True))
-        return self.own(families if self.box is None else (minimum_image(d, self.box) for d in families))
+        """Head minus tail along each spring, by shifted slices. A place that a family keeps for no spring has 1 m along each coordinate,
+        so that a law of one's own divides by no zero there.
+        """
+        apart, together = partial(_difference_anywhere, self.grid_shape), partial(_minus_accumulate_anywhere, self.grid_shape)
+        columns = [linear_call(apart, together, (), a) for a in x]
+        families = self.own(Vector(parts) for parts in zip(*columns, strict=True))
+        wrapped = families if self.box is None else self.own(minimum_image(d, self.box) for d in families)
+        entries = zip(wrapped.families, self.offsets, strict=True)
+        return self.own(d.map(partial(shifts.inside, self.grid_shape, offset=offset, fill=1)) for d, offset in entries)
 
     def accumulate(self, pulls: EdgeField) -> Vector:
         """Force on each node: each pull on its tail, the opposite on its head, by shifted slices."""

@@ -100,7 +100,7 @@ class Overlay(Topology):
     def identity(self) -> NetIdentity:
         """The springs' digest, and the name."""
         sizes = (f"{math.prod(self.node_shape)} nodes", f"{self.inner.n_springs} springs", f"digest {self.digest}")
-        return NetIdentity("Overlay", sizes, self.name)
+        return NetIdentity("Overlay", sizes, self.name, self.inner.springs)
 
     @property
     def edges(self) -> np.ndarray:

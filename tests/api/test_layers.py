@@ -23,7 +23,8 @@ LAYERS = {
     "memory": 1,
     "linalg": 2,
     "state": 2,  # a topology and its node fields; forces read it
-    "files": 3,
+    "files": 5,
+    "numbering": 5,  # what a file holds of nodes and springs
     "forces": 3,
     "thermal": 3,
     "masses": 4,

@@ -19,6 +19,7 @@ import pytest
 import jaxspring as js
 from jaxspring.archive import HEADER
 from jaxspring.forces.laws import has_no_direction, is_beyond_range, spring_block, spring_energy, spring_pull
+from jaxspring.memory import Memory, Owner
 from jaxspring.resume import Origin
 from jaxspring.rollouts import Info
 from jaxspring.thermal.ledger import Account
@@ -493,7 +494,7 @@ def instances():
         js.Reconstructed(*[None] * len(dataclasses.fields(js.Reconstructed))),
         *(js.Convection(TWO, nodes, 1.0, ambient, 1.0), js.FixedTemperature(TWO, nodes, 300.0), js.HeatFlux(TWO, nodes, 1.0, 1.0)),
         *(js.Radiation(TWO, nodes, 1.0, 300.0, 1.0), js.HotPlane((0.0,), (1.0,), 300.0, 1.0, 1.0, 0.1), js.ThermalBoundary()),
-        *(js.EqualCells(), js.HalfCells(), js.LatentHeat(350.0, 1.0), heat, fusing, js.Refreezing(1.0, 2.0), js.Ledger(heat)),
+        *(js.EqualCells(), js.HalfCells(), js.LatentHeat(350.0, 1.0), heat, fusing, js.Refreezing(1.0, 2.0), js.Ledger()),
         *(js.ThermalExpansion(1e-3, 300.0), js.ThermalStiffness(1.0, 300.0, 350.0), js.Molten(TWO)),
         *(js.Dashpots(TWO, 1.0), js.Drag(0.1), js.Rayleigh(0.1, 0.2), js.Gravity((0.0, -9.81)), js.Load(push), js.Floor((0.0,), (1.0,))),
         *(js.DataSprings(image, 1.0), js.ImageAttraction(image, 1.0), js.ImageStiffness(image, 1.0, 2.0, 1.0)),
@@ -502,6 +503,8 @@ def instances():
         *(image, image.surface(js.Bilinear()), js.Modes(number, number), js.Vector((number,)), TWO.edge_field(jnp.ones(1)), TWO, WHOLE),
         *(WHOLE.reduction, js.Graph.from_edges([(0, 1)], 2, reduction=js.Scatter).reduction, js.lattice((3, 3)).named("second")),
         *(js.Energy(number, (None,)), js.Finding(js.Flag.OUTSIDE, whole, whole), js.Flag.OK, status, js.StopReason.ITERATIONS),
+        *(system.bind(float), Memory(number, Owner("Heat", None), True), js.Rule(), js.Step(state, state, number)),
+        *(js.Scene(TWO, number, np.dtype(float), (), ()), TWO.with_edges([(0, 1)])),
         *(js.Equilibrium(state, info, whole, status, ("Springs",)), js.Solves(whole, number, status, info)),
         *(ode, js.OdeResult(state, None, number, status, ode, None, ("Springs",)), resume),
         js.Result(state, None, status, Info(None, whole), resume, ("Springs",)),

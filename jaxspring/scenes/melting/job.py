@@ -17,7 +17,7 @@ import jax
 import numpy as np
 
 from ...archive import atomic_folder, read_archive, write_archive
-from ...files import expect_same, named_arrays, restored
+from ...files import FORM, expect_same, named_arrays, restored
 from ...forces.base import Step
 from ...progress import Progress, Stopwatch
 from ...rollouts import rollout
@@ -144,7 +144,12 @@ class MeltRun:
         self.frames = tuple(arrays["frames/"][str(i)] for i in range(len(self.frames)))
 
     def _about(self) -> dict[str, Any]:
-        return {"kind": "melt", "settings": json.loads(json.dumps(asdict(self.settings))), "dtype": str(self.scene.state.dtype)}
+        return {
+            "kind": "melt",
+            "form": FORM,
+            "settings": json.loads(json.dumps(asdict(self.settings))),
+            "dtype": str(self.scene.state.dtype),
+        }
 
 
 def melt(settings: MeltSettings, out: pathlib.Path, progress: Progress | None = None, resume: bool = False) -> MeltOutcome:

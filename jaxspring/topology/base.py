@@ -148,6 +148,7 @@ class Topology(eqx.Module):
         """
         return dataclasses.replace(self, name=name)
 
+    @abc.abstractmethod
     def with_edges(self, edges: Any, name: str | None = None) -> Topology:
         """A further net over the same nodes, with springs of its own: bending springs, a seam, another graph.
 
@@ -167,9 +168,6 @@ class Topology(eqx.Module):
         >>> print(seam.lengths(sheet.grid()).round(2))
         [2.24 2.24]
         """
-        from .overlay import Overlay
-
-        return Overlay.on(self, edges, name)
 
     def owns(self, field: EdgeField) -> bool:
         """Whether an edge field tells about the springs of this net. One made by hand does not say, and is taken by its shapes."""

@@ -22,8 +22,9 @@ from ..vector import Vector
 from .base import Topology
 from .edge_field import EdgeField
 from .identity import NetIdentity
+from .overlay import Overlay
 from .periods import as_box, minimum_image
-from .permutation import Permutation
+from .permutation import Permutation, locality_order
 from .reduction import Gather, Reduction, Scatter, choose_reduction
 
 
@@ -78,7 +79,7 @@ class Graph(Topology):
         if n_nodes < 1:
             raise ValueError(f"n_nodes = {n_nodes}, but a network needs at least 1 node.")
         pairs = node_indices("edges", edges, n_nodes)
-        near = _locality_order(pairs, n_nodes)
+        near = locality_order(pairs, n_nodes)
         inner = np.argsort(near)[pairs]
         springs = Permutation(np.lexsort((inner.max(axis=1), inner.min(axis=1))))
         tails, heads = inner[springs.order].T
@@ -134,6 +135,10 @@ class Graph(Topology):
         inner = np.stack([np.asarray(self.tails), np.asarray(self.heads)], axis=-1)
         return self.nodes.order[inner][self.springs.inverse]
 
+    def with_edges(self, edges: Any, name: str | None = None) -> Overlay:
+        """A further net over the same nodes: see `Topology.with_edges`."""
+        return Overlay.on(self.layout, self.box, edges, name)
+
     def unboxed(self) -> Graph:
         """The same springs without periods."""
         return eqx.tree_at(lambda net: net.box, self, None, is_leaf=lambda leaf: leaf is None)
@@ -172,15 +177,3 @@ def _as_triangles(triangles: Any, n_nodes: int) -> np.ndarray:
     own = triangle_indices("triangles", triangles, n_nodes)
     own.setflags(write=False)
     return own
-
-
-def _locality_order(pairs: np.ndarray, n_nodes: int) -> np.ndarray:
-    """Reverse Cuthill-McKee order: joined nodes get near numbers, so that gathers stay in cache."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import reverse_cuthill_mckee
-
-    if not len(pairs):
-        return np.arange(n_nodes, dtype=np.int32)
-    both = np.concatenate([pairs, pairs[:, ::-1]])
-    matrix = coo_array((np.ones(len(both), np.int8), (both[:, 0], both[:, 1])), shape=(n_nodes, n_nodes)).tocsr()
-    return np.asarray(reverse_cuthill_mckee(matrix, symmetric_mode=True), np.int32)

@@ -27,6 +27,7 @@ from . import shifts
 from .base import Topology
 from .edge_field import EdgeField
 from .identity import NetIdentity
+from .overlay import Overlay
 from .periods import as_box, check_wrapped, minimum_image
 
 Offset = tuple[int, ...]
@@ -128,6 +129,10 @@ class Lattice(Topology):
             heads = np.roll(numbers, [-o for o in offset], range(len(offset)))
             pairs.append(np.stack([numbers[tails].ravel(), heads[tails].ravel()], axis=-1))
         return np.concatenate(pairs).astype(np.int32) if pairs else np.zeros((0, 2), np.int32)
+
+    def with_edges(self, edges: Any, name: str | None = None) -> Overlay:
+        """A further net over the same nodes: see `Topology.with_edges`."""
+        return Overlay.on(self.layout, self.box, edges, name)
 
     def unboxed(self) -> Lattice:
         """The same springs without periods."""

@@ -22,9 +22,10 @@ from ..numerics import linear_call
 from ..vector import Vector
 from .base import NodeLayout, Topology
 from .edge_field import EdgeField
-from .graph import Graph
 from .identity import NetIdentity
-from .permutation import Permutation
+from .periods import minimum_image
+from .permutation import Permutation, locality_order
+from .reduction import Reduction, choose_reduction
 
 # Nodes per touched node from which on writing to the touched ones is faster than having every node read.
 SPARSE = 8
@@ -36,45 +37,61 @@ class Overlay(Topology):
     """Springs over the nodes of another net. Build it with `net.with_edges`.
 
     Attributes:
-        inner: the springs as a graph of the touched nodes alone.
-        where: (T,) places in a flat node array of the nodes of `inner`, in its order.
-        back: (N,) for each node its place in `inner`, or T; None where few nodes are touched.
+        tails: (E,) tail of each spring among the touched nodes, in the order in which they are kept.
+        heads: (E,) head of each.
+        reduction: how pulls are summed on the touched nodes.
+        where: (T,) places of the touched nodes in a flat node array.
+        back: (N,) for each node its place among the touched ones, or T; None where few nodes are touched.
+        box: (D,) period of each coordinate [m], or None.
         nodes: how fields of all nodes are stored (static).
-        touched: user's numbers of the touched nodes (static, as bytes).
+        springs: from the user's order of the springs to the one in which they are kept (static).
         digest: of the springs in the user's numbering and order (static).
         name: tells it from other nets of the same springs, or None (static).
     """
 
-    inner: Graph
+    tails: Int[Array, " E"]
+    heads: Int[Array, " E"]
+    reduction: Reduction
     where: Int[Array, " T"]
     back: Int[Array, " N"] | None
+    box: Array | None
     nodes: NodeLayout = eqx.field(static=True)
-    touched: bytes = eqx.field(static=True)
+    springs: Permutation = eqx.field(static=True)
     digest: str = eqx.field(static=True)
     name: str | None = eqx.field(static=True, default=None)
 
     @staticmethod
-    def on(net: Topology, edges: Any, name: str | None = None) -> Overlay:
-        """A net of these springs over the nodes of `net`; see `Topology.with_edges`."""
-        count = net.n_nodes
+    def on(nodes: NodeLayout, box: Array | None, edges: Any, name: str | None = None) -> Overlay:
+        """A net of these springs over nodes that are stored like this; see `Topology.with_edges`."""
+        count = math.prod(nodes.shape)
         pairs = node_indices("edges", edges, count)
-        touched, local = np.unique(pairs, return_inverse=True)
+        places = np.arange(count) if nodes.permutation is None else nodes.permutation.inverse
+        touched, local = np.unique(places[pairs] if len(pairs) else np.zeros((0, 2), int), return_inverse=True)
         if not len(touched):
-            touched, local = np.zeros(1, np.int64), np.zeros((0, 2), np.int64)
-        inner = Graph.from_edges(local.reshape(-1, 2), len(touched), box=getattr(net, "box", None))
-        places = np.arange(count) if net.node_permutation is None else net.node_permutation.inverse
-        where = places[touched[inner.nodes.order]].astype(np.int32)
+            touched = np.zeros(1, int)  # arrays of no length compile nowhere
+        local = local.reshape(-1, 2)
+        near = locality_order(local, len(touched))
+        inner = np.argsort(near)[local]
+        springs = Permutation(np.lexsort((inner.max(axis=1), inner.min(axis=1))))
+        reduction, order = choose_reduction(len(touched)).build(*inner[springs.order].T, len(touched))
+        to_inner = np.argsort(near[order])
+        where = touched[near[order]].astype(np.int32)
         back = np.full(count, len(touched), np.int32)
         back[where] = np.arange(len(touched), dtype=np.int32)
-        digest = hashlib.sha256(np.ascontiguousarray(pairs, "<i4").data).hexdigest()[:16] if len(pairs) else ""
+        tails, heads = to_inner[local[springs.order]].astype(np.int32).T
         reads = len(touched) * SPARSE >= count
-        stored = np.ascontiguousarray(touched, "<i4").tobytes()
-        return Overlay(inner, jnp.asarray(where), jnp.asarray(back) if reads else None, net.layout, stored, digest, name)
-
-    @property
-    def box(self) -> Array | None:
-        """(D,) period of each coordinate [m], or None."""
-        return self.inner.box
+        return Overlay(
+            tails=jnp.asarray(tails),
+            heads=jnp.asarray(heads),
+            reduction=reduction,
+            where=jnp.asarray(where),
+            back=jnp.asarray(back) if reads else None,
+            box=box,
+            nodes=nodes,
+            springs=springs,
+            digest=hashlib.sha256(np.ascontiguousarray(pairs, "<i4").data).hexdigest()[:16] if len(pairs) else "",
+            name=name,
+        )
 
     @property
     def node_shape(self) -> tuple[int, ...]:
@@ -89,27 +106,33 @@ class Overlay(Topology):
     @property
     def family_shapes(self) -> tuple[tuple[int, ...], ...]:
         """((E,),)"""
-        return self.inner.family_shapes
+        return (self.tails.shape,)
 
     @property
     def family_sizes(self) -> tuple[int, ...]:
         """(E,)"""
-        return self.inner.family_sizes
+        return self.tails.shape
 
     @property
     def identity(self) -> NetIdentity:
         """The springs' digest, and the name."""
-        sizes = (f"{math.prod(self.node_shape)} nodes", f"{self.inner.n_springs} springs", f"digest {self.digest}")
-        return NetIdentity("Overlay", sizes, self.name, self.inner.springs)
+        springs = (f"{math.prod(self.node_shape)} nodes", f"{self.springs.order.size} springs", f"digest {self.digest}")
+        return NetIdentity("Overlay", springs, self.name, self.springs)
 
     @property
     def edges(self) -> np.ndarray:
         """(E, 2) tail and head of each spring, in the user's order and numbering."""
-        return np.frombuffer(self.touched, "<i4")[self.inner.edges]
+        places = np.asarray(self.where)[np.stack([np.asarray(self.tails), np.asarray(self.heads)], axis=-1)]
+        users = places if self.node_permutation is None else self.node_permutation.order[places]
+        return users[self.springs.inverse]
+
+    def with_edges(self, edges: Any, name: str | None = None) -> Overlay:
+        """A further net over the same nodes: see `Topology.with_edges`."""
+        return Overlay.on(self.layout, self.box, edges, name)
 
     def unboxed(self) -> Overlay:
         """The same springs without periods."""
-        return eqx.tree_at(lambda net: net.inner, self, self.inner.unboxed())
+        return eqx.tree_at(lambda net: net.box, self, None, is_leaf=lambda leaf: leaf is None)
 
     def inside(self, field: EdgeField, fill: float) -> EdgeField:
         """The field itself: no margins are kept."""
@@ -117,33 +140,34 @@ class Overlay(Topology):
 
     def difference(self, x: Vector) -> EdgeField:
         """Head minus tail along each spring."""
-        return self.own(self.inner.difference(x.map(self._taken)).families)
+        d = x.map(lambda a: self.reduction.difference(self._taken(a), self.tails, self.heads))
+        return self.own((d if self.box is None else minimum_image(d, self.box),))
 
     def accumulate(self, pulls: EdgeField) -> Vector:
         """Force on each node: each pull on its tail, the opposite on its head; zero on nodes that no spring touches."""
-        return self.inner.accumulate(pulls).map(self._spread_out)
+        return pulls.families[0].map(lambda p: self._put(self.reduction.accumulate(p, self.tails, self.heads)))
 
     def incident_sum(self, values: EdgeField) -> Array:
         """Sum over the springs at each node."""
-        return self._spread_out(self.inner.incident_sum(values))
+        return self._put(self.reduction.sum_at_nodes(values.families[0], self.tails, self.heads))
 
     def average(self, a: Array) -> EdgeField:
         """Mean of a node array over the two ends of each spring."""
-        return self.own(self.inner.average(self._taken(a)).families)
+        return self.own((self.reduction.mean_of_ends(self._taken(a), self.tails, self.heads),))
 
     def split(self, flat: Array) -> EdgeField:
         """(E,) array in the user's order -> edge field."""
-        return self.own(self.inner.split(flat).families)
+        return self.own((self.springs.inward(flat),))
 
     def _flatten(self, field: EdgeField) -> Array:
         """Edge field -> (E,) array in the user's order."""
-        return self.inner._flatten(field)
+        return self.springs.outward(field.families[0])
 
     def _taken(self, a: Array) -> Array:
         """Node array -> (T,)."""
         return linear_call(partial(_take, self.node_shape), partial(_put, self.node_shape), (self.where, self.back), a)
 
-    def _spread_out(self, v: Array) -> Array:
+    def _put(self, v: Array) -> Array:
         """(T,) -> node array, zero elsewhere."""
         return linear_call(partial(_put, self.node_shape), partial(_take, self.node_shape), (self.where, self.back), v)
 

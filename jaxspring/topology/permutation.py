@@ -53,3 +53,15 @@ def _gather_first(tables: tuple[Array, Array], a: Array) -> Array:
 
 def _gather_second(tables: tuple[Array, Array], a: Array) -> Array:
     return a[..., tables[1]]
+
+
+def locality_order(pairs: np.ndarray, n_nodes: int) -> np.ndarray:
+    """Reverse Cuthill-McKee order: joined nodes get near numbers, so that gathers stay in cache."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+    if not len(pairs):
+        return np.arange(n_nodes, dtype=np.int32)
+    both = np.concatenate([pairs, pairs[:, ::-1]])
+    matrix = coo_array((np.ones(len(both), np.int8), (both[:, 0], both[:, 1])), shape=(n_nodes, n_nodes)).tocsr()
+    return np.asarray(reverse_cuthill_mckee(matrix, symmetric_mode=True), np.int32)

@@ -23,6 +23,7 @@ LAYERS = {
     "linalg": 2,
     "state": 2,  # a topology and its node fields; forces read it
     "files": 3,
+    "export": 3,  # files for viewers: states, nets, archives
     "forces": 3,
     "thermal": 3,
     "masses": 4,

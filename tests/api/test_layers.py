@@ -23,7 +23,6 @@ LAYERS = {
     "linalg": 2,
     "state": 2,  # a topology and its node fields; forces read it
     "files": 3,
-    "export": 3,  # files for viewers: states, nets, archives
     "forces": 3,
     "thermal": 3,
     "masses": 4,
@@ -43,6 +42,7 @@ LAYERS = {
     "inverse": 7,
     "study": 7,
     "plots": 7,
+    "export": 7,  # files for viewers
     "scenes": 8,
     "cli": 8,
     "__main__": 9,

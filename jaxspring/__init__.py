@@ -27,6 +27,9 @@ _HOMES = {
     "watch": ("Solves",),
     "progress": ("Progress",),
     "files": ("load", "save", "save_trajectory"),
+    "export.vtk": ("save_vtk",),
+    "export.xyz": ("save_xyz",),
+    "export.ply": ("save_ply",),
     "archive": ("CheckpointError",),
     "plots": ("animate", "plot"),
     "topology.edge_field": ("EdgeField",),
@@ -148,6 +151,9 @@ if TYPE_CHECKING:  # written by `python -m tests.face`
     from .files import load as load
     from .files import save as save
     from .files import save_trajectory as save_trajectory
+    from .export.vtk import save_vtk as save_vtk
+    from .export.xyz import save_xyz as save_xyz
+    from .export.ply import save_ply as save_ply
     from .archive import CheckpointError as CheckpointError
     from .plots import animate as animate
     from .plots import plot as plot

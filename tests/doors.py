@@ -179,7 +179,7 @@ DOORS: dict[str, Door] = {
 }
 
 # Doors whose work is too long for every form of every field: tested by hand below or elsewhere.
-BY_HAND = {"diffeqsolve", "fit", "check_gradient", "frequency_response", "from_networkx", "plot"}
+BY_HAND = {"diffeqsolve", "fit", "check_gradient", "frequency_response", "from_networkx", "plot", "save_ply", "save_vtk", "save_xyz"}
 
 # What the library makes and hands out; nobody else builds it.
 MADE_INSIDE = """

@@ -46,6 +46,7 @@ LAYERS = {
     "inverse": 7,
     "study": 7,
     "plots": 7,
+    "export": 7,  # files for viewers
     "scenes": 8,
     "cli": 8,
     "__main__": 9,

@@ -13,6 +13,7 @@ import pytest
 
 from jaxspring import cli
 from jaxspring.archive import read_archive
+from jaxspring.scenes.reconstruction import command
 from tests import source
 
 RUN = ["--nodes", "5x6", "--iterations", "4"]
@@ -76,15 +77,16 @@ def test_bad_arguments_get_one_line_and_code_2(arguments, words, folder, capsys)
 
 def test_defaults():
     """The mesh is 41 x 41, one stiffness per spring is fitted, and the folder is named by the image."""
-    arguments = cli.parse(["fit", "some/photo.png"])
-    assert (arguments.nodes, arguments.parameters, str(arguments.out)) == ((41, 41), ("stiffness",), "jaxspring-photo")
-    assert str(cli.parse(["fit"]).out) == "jaxspring-elevation"
-    assert cli.parse(["fit", "--nodes", "9X12"]).nodes == (9, 12)
+    chosen, given = cli.parse(["fit", "some/photo.png"])
+    assert chosen is command.COMMAND
+    assert (given.nodes, given.parameters, str(command.folder(given))) == ((41, 41), ("stiffness",), "jaxspring-photo")
+    assert str(command.folder(cli.parse(["fit"])[1])) == "jaxspring-elevation"
+    assert cli.parse(["fit", "--nodes", "9X12"])[1].nodes == (9, 12)
 
 
 def test_help_is_fast():
     """`--help` and mistakes load neither jax nor numpy."""
-    code = "import sys; from jaxspring.cli import main; main(['fit', '--help']); main(['fit', '--nodes', 'x']); "
+    code = "import sys; from jaxspring.cli import main; main(['--help']); main(['fit', '--nodes', 'x']); main(['melt', '--help']); "
     code += "sys.exit(sum(m in sys.modules for m in ('jax', 'numpy', 'matplotlib')))"
     assert subprocess.run([sys.executable, "-c", code], cwd=source.ROOT, capture_output=True).returncode == 0
 
@@ -161,7 +163,7 @@ def test_transparent_pixels_are_refused_and_the_option_named(folder, capsys):
     line = complaint(["fit", "logo.png"], capsys)
     assert "pixel [2, 5] is transparent" in line
     assert "--fill" in line
-    filled = cli._load(cli.parse(["fit", "logo.png", "--fill", "-3.5"])).values
+    filled = command.load(cli.parse(["fit", "logo.png", "--fill", "-3.5"])[1]).values
     np.testing.assert_array_equal(filled, np.where(pixels[..., 1] == 0, -3.5, 255.0))
 
 
@@ -220,7 +222,7 @@ def check_mesh(report):
 
 def check_interrupt_and_resume(hill, report, capsys, monkeypatch):
     """Ctrl-C leaves a checkpoint alone, with code 130; --resume goes on bit for bit."""
-    from jaxspring.scenes import job
+    from jaxspring.scenes.reconstruction import job
 
     bar = job.draw_bar
 
@@ -244,7 +246,7 @@ def check_interrupt_and_resume(hill, report, capsys, monkeypatch):
 
 def check_failure_leaves_nothing(hill, capsys, monkeypatch):
     """Where a picture cannot be written, the old folder stays as it was, and no temporary one is left."""
-    from jaxspring.scenes import job
+    from jaxspring.scenes.reconstruction import job
 
     def full(folder, image, found):
         (folder / "half.png").touch()
@@ -277,5 +279,5 @@ def test_the_command_makes_as_many_updates_as_the_settings_say():
     from jaxspring.scenes.reconstruction.constants import ConstantsSettings
     from jaxspring.scenes.reconstruction.fitting import SpringSettings
 
-    assert SpringSettings().n_iterations == cli.UPDATES_OF_STIFFNESS
-    assert ConstantsSettings().n_iterations == cli.UPDATES_OF_CONSTANTS
+    assert SpringSettings().n_iterations == command.UPDATES_OF_STIFFNESS
+    assert ConstantsSettings().n_iterations == command.UPDATES_OF_CONSTANTS

@@ -1,6 +1,6 @@
-"""The command `jaxspring melt`: run the scene, check it, and write report, pictures and animation.
+"""A block from its settings to a folder: run the scene, check it, and write report, pictures and animation.
 
-The folder appears at the end, whole. Until then there is a checkpoint beside it, from which a later call goes on to the same bits.
+Until the folder is whole there is a checkpoint beside it, from which a later call goes on to the same bits.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from ...archive import atomic_folder, read_archive, write_archive
+from ...archive import read_archive, write_archive
 from ...files import FORM, expect_same, named_arrays, restored
 from ...forces.base import Step
 from ...progress import Progress, Stopwatch
@@ -26,28 +26,13 @@ from ...status import Status
 from ...steppers.explicit import SymplecticEuler
 from ...thermal.fusing import melted_fraction
 from ...thermal.ledger import energy_ledger
+from ..command import FailedError, StoppedError, Written
 from ..drawing import canvas_and_figure
+from ..folder import ResultFolder
 from .pictures import draw_animation, draw_strip
 from .scene import Melting, MeltSettings, melting_block
 
 FRAMES = 60
-
-
-@dataclass(frozen=True)
-class MeltOutcome:
-    """How a run ended.
-
-    Attributes:
-        is_interrupted: by Ctrl-C; there is a checkpoint to go on from.
-        frames: how many were done.
-        failure: one line, or empty where the folder was written.
-        table: what happened, for the terminal.
-    """
-
-    is_interrupted: bool = False
-    frames: int = 0
-    failure: str = ""
-    table: str = ""
 
 
 @dataclass(frozen=True)
@@ -152,50 +137,46 @@ class MeltRun:
         }
 
 
-def melt(settings: MeltSettings, out: pathlib.Path, progress: Progress | None = None, resume: bool = False) -> MeltOutcome:
+def melt(settings: MeltSettings, out: pathlib.Path, progress: Progress | None = None, resume: bool = False) -> Written:
     """Run, check and write; or go on from where an earlier call was interrupted.
 
     Raises:
         OSError: there is no checkpoint to go on from, or none can be written.
         CheckpointError: the checkpoint is damaged or of other settings.
         ImportError: what draws the pictures is not installed.
+        StoppedError: Ctrl-C; there is a checkpoint to go on from.
+        FailedError: the run failed, or the folder could not be written.
     """
     canvas_and_figure()
     clock = Stopwatch()
     run = MeltRun(melting_block(settings), settings)
-    place = out.absolute().with_name(out.absolute().name + ".checkpoint.npz")
+    place = ResultFolder(out)
     if resume:
-        if not place.exists():
-            raise FileNotFoundError(f"--resume: there is no checkpoint of {out}; run without --resume first.")
-        run.read(place)
+        place.take_up()
+        run.read(place.checkpoint)
     try:
-        run.go_on(progress, place)
-        return _finish(run, out, place, clock)
+        run.go_on(progress, place.checkpoint)
+        return _finish(run, place, clock)
     except KeyboardInterrupt:
         if run.done == 0:
             raise
-        return MeltOutcome(is_interrupted=True, frames=run.done)
+        raise StoppedError(f"{run.done} frames") from None
 
 
-def _finish(run: MeltRun, out: pathlib.Path, place: pathlib.Path, clock: Stopwatch) -> MeltOutcome:
+def _finish(run: MeltRun, place: ResultFolder, clock: Stopwatch) -> Written:
     """Check, and fill the folder, all or nothing."""
     scene, settings, frames = run.scene, run.settings, run.seen()
     if not bool(run.status.is_ok):
-        return MeltOutcome(frames=run.done, failure=f"the run failed: {run.status.describe(run.effects)}.")
+        raise FailedError(f"the run failed: {run.status.describe(run.effects)}.")
     seconds = {"run": clock.seconds, **seconds_per_effect(scene, run.state)}
     report = report_of(scene, settings, run.state, frames, seconds)
     lowest = report["lowest_particle_m"]
     if lowest < -1e-6 * settings.spacing:
-        return MeltOutcome(frames=run.done, failure=f"a particle is {-lowest:.3g} m below the floor.")
-    try:
-        with atomic_folder(out) as folder:
-            draw_strip(folder / "strip.png", frames, settings)
-            draw_animation(folder / "melting.gif", frames, settings)
-            (folder / "report.json").write_text(json.dumps(report, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    except OSError as error:
-        return MeltOutcome(frames=run.done, failure=f"the results could not be written ({error}); --resume tries again without a new run.")
-    place.unlink(missing_ok=True)
-    return MeltOutcome(frames=run.done, table=table(report))
+        raise FailedError(f"a particle is {-lowest:.3g} m below the floor.")
+    with place.filling(report) as folder:
+        draw_strip(folder / "strip.png", frames, settings)
+        draw_animation(folder / "melting.gif", frames, settings)
+    return Written(table(report), "report.json, strip.png and melting.gif")
 
 
 def report_of(scene: Melting, settings: MeltSettings, end: State, frames: Frames, seconds: dict[str, float]) -> dict[str, Any]:
@@ -259,4 +240,4 @@ def _fastest(call: Any, arguments: tuple[Any, ...], repeats: int) -> float:
     return min(spent)
 
 
-__all__ = ["Frames", "MeltOutcome", "MeltRun", "exchanged", "melt", "report_of", "seconds_per_effect", "table"]
+__all__ = ["Frames", "MeltRun", "exchanged", "melt", "report_of", "seconds_per_effect", "table"]

@@ -1,58 +1,31 @@
 """The main job from an image to a folder: fit, measure, and write report, mesh and pictures.
 
-The folder appears at the end, whole. Until then there is only a checkpoint beside it, which a later call may go on from; in the end it
-moves into the folder.
+Until the folder is whole there is only a checkpoint beside it, which a later call may go on from; in the end it moves into the folder.
 """
 
 from __future__ import annotations
 
 import hashlib
-import importlib.metadata
-import json
 import math
 import pathlib
-import platform
-import shutil
 from dataclasses import dataclass
 from typing import Any
 
-import jax
 import numpy as np
 
-from .._version import __version__
-from ..archive import atomic_folder, write_archive
-from ..images.files import ImageError
-from ..images.image import Image
-from ..inverse.checkpoint import Checkpoint
-from ..inverse.fit import Iteration
-from ..inverse.stopping import StopReason
-from ..progress import Stopwatch, draw_bar
-from .drawing import canvas_and_figure
+from ...archive import write_archive
+from ...images.files import ImageError
+from ...images.image import Image
+from ...inverse.checkpoint import Checkpoint
+from ...inverse.fit import Iteration
+from ...inverse.stopping import StopReason
+from ...progress import Stopwatch, draw_bar
+from ..command import FailedError, StoppedError, Written
+from ..drawing import canvas_and_figure
+from ..folder import ResultFolder, versions
+from .constants import Constants, ConstantsSettings, fit_constants
+from .fitting import Reconstructed, SpringSettings, fit_springs
 from .pictures import draw_pictures, triangle_corners
-from .reconstruction.constants import Constants, ConstantsSettings, fit_constants
-from .reconstruction.fitting import Reconstructed, SpringSettings, fit_springs
-
-CHECKPOINT = "checkpoint.npz"
-PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "equinox", "optax", "optimistix", "lineax", "diffrax", "matplotlib", "pillow", "tifffile")
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """How a job ended.
-
-    Attributes:
-        iterations: updates done.
-        is_interrupted: by Ctrl-C; there is a checkpoint to go on from.
-        failure: one line, or empty where the folder was written.
-        table: the errors, for the terminal.
-        pictures: names of the pictures written.
-    """
-
-    iterations: int
-    is_interrupted: bool = False
-    failure: str = ""
-    table: str = ""
-    pictures: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -75,44 +48,37 @@ class Job:
     n_iterations: int
     out: pathlib.Path
 
-    def run(self, resume: bool) -> Outcome:
+    def run(self, resume: bool) -> Written:
         """Fit and write.
 
         Raises:
             ImageError: the image is too small for a surface.
             CheckpointError: the checkpoint is damaged or of another problem.
-            OSError: there is no checkpoint to go on from, or the folder cannot be written.
+            OSError: there is no checkpoint to go on from, or none can be written.
             ImportError: what draws the pictures is not installed.
+            StoppedError: Ctrl-C; there is a checkpoint to go on from.
+            FailedError: the fit failed, or the folder could not be written.
         """
         canvas_and_figure()
         if min(self.image.shape) < 2:
             size = "{} x {}".format(*self.image.shape)
             raise ImageError(f"{self.name}: {size} pixels hold no surface; an image needs 2 x 2 at least.")
-        place = self._checkpoint(resume)
+        place = ResultFolder(self.out)
+        if resume:
+            place.take_up()
         clock, bar = Stopwatch(), _Bar(self)
-        found = self._fit(bar, place, resume)
+        found = self._fit(bar, self._checkpoint(place.checkpoint), resume)
         done = len(found.fit.history.loss) - 1
         if found.fit.reason is StopReason.INTERRUPTED:
-            return Outcome(done, is_interrupted=True)
+            raise StoppedError(f"{done} iterations")
         status = found.fit.status.then(found.status)
         if not bool(status.is_ok):
-            return Outcome(done, failure=f"the fit failed after {done} iterations: {status.describe()}.")
+            raise FailedError(f"the fit failed after {done} iterations: {status.describe()}.")
         report = self._report(found, bar, clock.seconds)
-        try:
-            pictures = self._write(found, report, place)
-        except OSError as error:
-            return Outcome(done, failure=f"the results could not be written ({error}); --resume tries again without fitting anew.")
-        return Outcome(done, table=table(report), pictures=pictures)
-
-    def _write(self, found: Reconstructed, report: dict[str, Any], place: Checkpoint) -> tuple[str, ...]:
-        """Fill the folder, all or nothing; returns the names of the pictures."""
-        with atomic_folder(self.out) as folder:
-            (folder / "report.json").write_text(json.dumps(report, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        with place.filling(report, keep_checkpoint=True, lost="fitting anew") as folder:
             write_archive(folder / "mesh.npz", mesh_arrays(found), {"kind": "mesh"})
             pictures = draw_pictures(folder, self.image, found)
-            shutil.copyfile(place.path, folder / CHECKPOINT)
-        pathlib.Path(place.path).unlink()
-        return pictures
+        return Written(table(report), f"report.json, mesh.npz and {len(pictures)} pictures")
 
     def _fit(self, bar: _Bar, place: Checkpoint, resume: bool) -> Reconstructed:
         if self.parameters == ("stiffness",):
@@ -131,19 +97,13 @@ class Job:
             "after": {name: float(found.fit.parameters[name]) for name in self.parameters},
         }
 
-    def _checkpoint(self, resume: bool) -> Checkpoint:
-        """Where the fit is saved: beside the folder, so that the folder is never half full."""
-        beside = self.out.absolute().with_name(self.out.absolute().name + "." + CHECKPOINT)
-        if resume and not beside.exists():
-            finished = self.out / CHECKPOINT
-            if not finished.exists():
-                raise FileNotFoundError(f"--resume: there is no checkpoint of {self.out}; run without --resume first.")
-            shutil.copyfile(finished, beside)
+    def _checkpoint(self, path: pathlib.Path) -> Checkpoint:
+        """Where the fit is saved, and of which problem it is."""
         pixels = np.ascontiguousarray(self.image.values)
         digest = hashlib.sha256(pixels.data).hexdigest()[:16]
         size, nodes = ("{}x{}".format(*pair) for pair in (self.image.shape, self.nodes))
         note = f"image {size} {digest}, nodes {nodes}, {','.join(self.parameters)}"
-        return Checkpoint(str(beside), every=25, note=note)
+        return Checkpoint(str(path), every=25, note=note)
 
     def _report(self, found: Reconstructed, bar: _Bar, seconds: float) -> dict[str, Any]:
         history, values = found.fit.history, np.asarray(self.image.values)
@@ -206,17 +166,6 @@ def summary(stiffness: Any) -> dict[str, float]:
     """Smallest, median and largest stiffness [N/m], and how many; all of them are in mesh.npz."""
     k = np.asarray(stiffness, np.float64)
     return {"smallest": float(k.min()), "median": float(np.median(k)), "largest": float(k.max()), "count": int(k.size)}
-
-
-def versions() -> dict[str, str]:
-    """Versions of what the numbers depend on."""
-    found = {"jaxspring": __version__, "python": platform.python_version(), "device": jax.devices()[0].device_kind}
-    for package in PACKAGES:
-        try:
-            found[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            continue
-    return found
 
 
 def table(report: dict[str, Any]) -> str:

@@ -11,11 +11,11 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ..images.image import Image
-from .drawing import canvas_and_figure
-from .reconstruction.fitting import Reconstructed
-from .reconstruction.report import uniform_errors
-from .reconstruction.triangles import corners
+from ...images.image import Image
+from ..drawing import canvas_and_figure
+from .fitting import Reconstructed
+from .report import uniform_errors
+from .triangles import corners
 
 DPI = 130
 

@@ -1,0 +1,1 @@
+"""States and runs as files that viewers read: VTK, XYZ, PLY."""

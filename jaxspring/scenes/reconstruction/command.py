@@ -1,0 +1,114 @@
+"""The command `jaxspring fit`."""
+
+from __future__ import annotations
+
+import argparse
+import pathlib
+from typing import TYPE_CHECKING
+
+from ..command import Command, UnusableError, Written, number, whole_number
+
+if TYPE_CHECKING:
+    from ...images.image import Image
+
+LAW = ("k_min", "k_max", "sigma", "k_data", "drag")
+# As SpringSettings and ConstantsSettings have them; a test compares. Repeated so that `--help` loads no JAX.
+UPDATES_OF_STIFFNESS, UPDATES_OF_CONSTANTS = 700, 100
+PARAMETERS = ("stiffness", "k_pixel", *LAW)
+LARGEST_MESH = 4_000_000  # nodes: beyond, one rollout alone takes minutes
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """What `jaxspring fit` takes."""
+    parser.add_argument(
+        "image", nargs="?", metavar="IMAGE", help="PNG, JPEG, TIFF, .npy or .npz; the built-in elevation model unless given"
+    )
+    parser.add_argument("--nodes", type=nodes, default=(41, 41), metavar="NYxNX", help="nodes of the mesh along y and x (41x41)")
+    parser.add_argument(
+        "--parameters",
+        type=parameters,
+        default=("stiffness",),
+        metavar="LIST",
+        help=f"what is fitted: stiffness (one per spring, the default), k_pixel, or some of {','.join(LAW)}",
+    )
+    parser.add_argument(
+        "--iterations",
+        type=whole_number,
+        metavar="N",
+        help=f"updates ({UPDATES_OF_STIFFNESS} of the stiffness, {UPDATES_OF_CONSTANTS} of constants)",
+    )
+    parser.add_argument("--out", metavar="DIR", help="folder for the results (jaxspring-<image>); an older result there is replaced")
+    parser.add_argument("--fill", type=number, metavar="VALUE", help="what stands where a pixel is no-data, masked, NaN or transparent")
+    parser.add_argument("--page", type=whole_number, metavar="N", help="page of a TIFF, or frame of an animated PNG, from 0")
+    parser.add_argument(
+        "--resume", action="store_true", help="go on from the checkpoint of an interrupted or finished run with the same DIR"
+    )
+
+
+def folder(given: argparse.Namespace) -> pathlib.Path:
+    """Where the results go: named by the image unless given."""
+    stem = "elevation" if given.image is None else pathlib.Path(given.image).stem or "image"
+    return pathlib.Path(given.out or f"jaxspring-{stem}")
+
+
+def run(given: argparse.Namespace, out: pathlib.Path) -> Written:
+    """Load the image, fit, write the folder; see `job.Job`.
+
+    Raises:
+        UnusableError: the image cannot be used.
+    """
+    from ...images.files import ImageError
+    from .job import Job
+
+    name = "elevation model of matplotlib" if given.image is None else str(pathlib.Path(given.image))
+    usual = UPDATES_OF_STIFFNESS if given.parameters == ("stiffness",) else UPDATES_OF_CONSTANTS
+    updates = usual if given.iterations is None else given.iterations
+    try:
+        return Job(load(given), name, given.nodes, given.parameters, updates, out).run(given.resume)
+    except ImageError as error:
+        raise UnusableError(str(error)) from error
+
+
+def load(given: argparse.Namespace) -> Image:
+    """The image that the arguments name, or the built-in one."""
+    from ...images.files import Luminance, elevation_model, load_image
+
+    if given.image is None:
+        return elevation_model()
+    return load_image(pathlib.Path(given.image), channel=Luminance(), fill=given.fill, page=given.page)
+
+
+def nodes(text: str) -> tuple[int, int]:
+    """`41x41` as (41, 41)."""
+    parts = text.lower().split("x")
+    if len(parts) != 2 or not all(part.isascii() and part.isdigit() for part in parts):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of rows and columns such as 41x41")
+    ny, nx = int(parts[0]), int(parts[1])
+    if min(ny, nx) < 3:
+        raise argparse.ArgumentTypeError(f"{text!r}: a mesh needs at least 3x3 nodes")
+    if ny * nx > LARGEST_MESH:
+        raise argparse.ArgumentTypeError(f"{text!r}: more than {LARGEST_MESH} nodes")
+    return ny, nx
+
+
+def parameters(text: str) -> tuple[str, ...]:
+    """`k_min,k_max` as ("k_min", "k_max")."""
+    names = tuple(part.strip() for part in text.split(","))
+    unknown = [name for name in names if name not in PARAMETERS]
+    if unknown:
+        raise argparse.ArgumentTypeError(f"{', '.join(unknown) or 'nothing'} is not among {', '.join(PARAMETERS)}")
+    if len(set(names)) != len(names):
+        raise argparse.ArgumentTypeError(f"{text!r} names something twice")
+    if len(names) > 1 and not set(names) <= set(LAW):
+        raise argparse.ArgumentTypeError(f"{text!r}: stiffness and k_pixel are fitted alone; only {', '.join(LAW)} go together")
+    return names
+
+
+COMMAND = Command(
+    name="fit",
+    help="fit a spring mesh to an image",
+    description="Fit a spring mesh to an image by gradients through the simulation, and write a report, the mesh and pictures.",
+    add_arguments=add_arguments,
+    folder=folder,
+    run=run,
+)

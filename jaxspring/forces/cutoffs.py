@@ -55,7 +55,7 @@ class NoCutoff(Cutoff):
 
     @property
     def reach(self) -> None:
-        """None."""
+        """No distance: the law has no end."""
         return None
 
     def weight(self, law: PairLaw, squared: Array) -> Array:

@@ -61,11 +61,11 @@ class Drag(Force):
         return jnp.sum(0.5 * dt * self._gamma(state).astype(state.dtype) * state.velocity.dot(state.velocity))
 
     def is_symmetric(self, state: State) -> bool:
-        """Yes: it acts on each coordinate alone."""
+        """Whether -dF/dv is symmetric: drag acts on each coordinate alone."""
         return True
 
     def can_feed(self, state: State) -> bool:
-        """No: drag takes energy out."""
+        """Whether the force can raise the energy: drag takes energy out."""
         return False
 
     def damping_bound(self, state: State) -> Array:
@@ -152,7 +152,7 @@ class Dashpots(Force):
         return turned_springs(self.net, start.position, state.position, living(self.net, state))
 
     def can_feed(self, state: State) -> bool:
-        """No: a damper takes energy out."""
+        """Whether the force can raise the energy: a damper takes energy out."""
         return False
 
     def damping_bound(self, state: State) -> Array | None:

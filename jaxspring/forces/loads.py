@@ -112,5 +112,5 @@ class Load(Force):
         return -jnp.sum(self.force(state).dot(state.position))
 
     def is_symmetric(self, state: State) -> bool:
-        """Yes: it does not depend on the position."""
+        """Whether -dF/dx is symmetric: a load does not depend on position."""
         return True

@@ -211,7 +211,7 @@ class LennardJones(PairLaw):
 
     @property
     def uses_mass(self) -> bool:
-        """No."""
+        """Whether both masses multiply the law: epsilon alone says how strong it is."""
         return False
 
     def weight(self, squared: Array) -> Array:

@@ -124,7 +124,7 @@ class Rayleigh(Force):
         return blocks
 
     def can_feed(self, state: State) -> bool:
-        """No: both terms take energy out."""
+        """Whether the force can raise the energy: both terms take energy out."""
         return False
 
     def damping_bound(self, state: State) -> Array:

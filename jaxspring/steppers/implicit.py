@@ -130,7 +130,7 @@ class ImplicitStepper(Stepper):
 
     @property
     def runs_backward(self) -> bool:
-        """No: backward in time the matrix is not positive definite."""
+        """Whether dt may be negative: backward in time the matrix is not positive definite."""
         return False
 
     def step(self, system: System, state: State, dt: Array, memory: Memory) -> tuple[State, Memory]:
@@ -172,7 +172,7 @@ class BackwardEuler(ImplicitStepper):
 
     @classmethod
     def is_newton_by_default(cls) -> bool:
-        """No: one linear solve keeps order 1."""
+        """Whether the order needs converged steps: one linear solve keeps order 1."""
         return False
 
     def stage(self, system: System, state: State, dt: Array, history: None) -> Stage:
@@ -194,7 +194,7 @@ class ImplicitMidpoint(ImplicitStepper):
 
     @classmethod
     def is_newton_by_default(cls) -> bool:
-        """Yes: the clamped tangent of a single solve would lower the order where springs are squeezed."""
+        """Whether the order needs converged steps: the clamped tangent of one solve would lower it where springs are squeezed."""
         return True
 
     def stage(self, system: System, state: State, dt: Array, history: None) -> Stage:
@@ -218,11 +218,11 @@ class BDF2(ImplicitStepper):
 
     @classmethod
     def is_newton_by_default(cls) -> bool:
-        """Yes: the clamped tangent of a single solve would lower the order where springs are squeezed."""
+        """Whether the order needs converged steps: the clamped tangent of one solve would lower it where springs are squeezed."""
         return True
 
     def first_history(self, state: State) -> tuple[Array, Vector, Vector]:
-        """No state before the first."""
+        """What stands for the state before the first: none, so that the first step is backward Euler's."""
         return jnp.zeros((), bool), state.position, state.velocity
 
     def remember(self, state: State) -> tuple[Array, Vector, Vector]:

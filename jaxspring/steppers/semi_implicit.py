@@ -73,7 +73,7 @@ class SemiImplicit(Stepper):
 
     @property
     def runs_backward(self) -> bool:
-        """No: damping backward in time grows without bound."""
+        """Whether dt may be negative: damping backward in time grows without bound."""
         return False
 
     def report(self, memory: Memory | None) -> SolveInfo | None:

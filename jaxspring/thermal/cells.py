@@ -64,7 +64,7 @@ class EqualCells(Cells):
     """The same volume for every node."""
 
     def share(self, net: Lattice, axis: int) -> np.ndarray:
-        """One."""
+        """A full spacing for every node."""
         return np.ones(net.shape[axis])
 
 

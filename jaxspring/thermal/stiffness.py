@@ -75,7 +75,7 @@ class ThermalStiffness(StiffnessRule):
 
     @property
     def follows_position(self) -> bool:
-        """No: at a given temperature the springs have a potential."""
+        """Whether the stiffness depends on where the nodes are: at a given temperature the springs have a potential."""
         return False
 
     def stiffness(self, net: Topology, state: State) -> EdgeField:

@@ -99,17 +99,17 @@ class Graph(Topology):
 
     @property
     def node_shape(self) -> tuple[int, ...]:
-        """(N,)"""
+        """Shape of a node array: (N,)."""
         return (self.count,)
 
     @property
     def family_shapes(self) -> tuple[tuple[int, ...], ...]:
-        """((E,),)"""
+        """Shape of an edge field of the only family of springs: ((E,),)."""
         return (self.tails.shape,)
 
     @property
     def family_sizes(self) -> tuple[int, ...]:
-        """(E,)"""
+        """Number of springs of the only family: (E,)."""
         return self.tails.shape
 
     def inside(self, field: EdgeField, fill: float) -> EdgeField:

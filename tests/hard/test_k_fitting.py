@@ -382,11 +382,11 @@ def test_what_an_adaptive_solver_cannot_honour_is_named():
 
         @property
         def is_rule(self):
-            """It does."""
+            """Whether it acts after steps."""
             return True
 
         def force(self, state):
-            """Nothing."""
+            """No pull on any node."""
             return js.Vector.zeros_like(state.position)
 
     for system in (

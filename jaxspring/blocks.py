@@ -121,7 +121,7 @@ def run_blocks(
         return carry, status if plan.check_every else inspect(carry, status)
 
     def stretch(pair: Pair, n: int) -> Pair:
-        """N steps, in blocks."""
+        """n steps, in blocks."""
         whole, rest = divmod(n, plan.block)
         if whole == 1:
             pair = block(pair, plan.block)

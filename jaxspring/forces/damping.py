@@ -53,11 +53,11 @@ class Drag(Force):
         return -(self._gamma(state) * state.velocity)
 
     def damping_blocks(self, state: State) -> Blocks:
-        """Gamma on the diagonal [N s/m]."""
+        """gamma on the diagonal [N s/m]."""
         return Blocks((isotropic(self._gamma(state), state.position),))
 
     def incremental_potential(self, state: State, dt: Array) -> Array:
-        """Dt gamma v^2 / 2, summed [J]."""
+        """dt gamma v^2 / 2, summed [J]."""
         return jnp.sum(0.5 * dt * self._gamma(state).astype(state.dtype) * state.velocity.dot(state.velocity))
 
     def is_symmetric(self, state: State) -> bool:
@@ -69,11 +69,11 @@ class Drag(Force):
         return False
 
     def damping_bound(self, state: State) -> Array:
-        """Gamma [N s/m]."""
+        """gamma [N s/m]."""
         return self._gamma(state).astype(state.dtype)
 
     def damping_floor(self, state: State) -> Array:
-        """Gamma [N s/m]."""
+        """gamma [N s/m]."""
         return self._gamma(state).astype(state.dtype)
 
     def invalid(self) -> Array:

@@ -202,7 +202,7 @@ class ImplicitMidpoint(ImplicitStepper):
         return _stage(system, state, state.position, state.velocity, 0.5 * dt, state.time + 0.5 * dt)
 
     def finish(self, state: State, dt: Array, stage: Stage, y: Vector) -> State:
-        """X + dt v*, 2 v* - v."""
+        """x + dt v*, 2 v* - v."""
         middle = stage.full(y)
         return state.moved(state.position + dt * middle, stage.system.hold(2 * middle - state.velocity), state.time + dt)
 

@@ -1,9 +1,15 @@
-"""What docstrings say: an answer comes with its question."""
+"""What docstrings say: an answer with its question, symbols in their own case."""
 
+import ast
 import re
 
 from tests import docstrings
 
+GREEK = "alpha beta gamma delta epsilon zeta eta theta kappa lambda mu nu xi rho sigma tau phi chi psi omega"
+LETTERS = "|".join(["[A-Za-z]", "[dD][A-Za-z]", *GREEK.split(), *GREEK.title().split()])
+SYMBOL = re.compile(rf"(?:{LETTERS})(?:_\w+)?(?![\w-])")
+# Where a sentence begins: at the top, after a paragraph, after another sentence.
+SENTENCE = re.compile(r"\A|(?<=\n\n)|(?<=[a-z)\]]\. )")
 # Classes that are being written anew elsewhere: take a name out when it fails.
 STILL_ANSWERS = {"Floor.obstacles", "Fluid.is_rule", "Fluid.can_feed", "Heat.sets_temperature"}
 
@@ -14,3 +20,52 @@ def test_no_docstring_is_a_bare_answer():
     bare = [d for d in docstrings.all_docstrings() if answer.match(d.text) or len(d.text.split()) == 1]
     assert [d.place for d in bare if d.name not in STILL_ANSWERS] == []
     assert {d.name for d in bare} >= STILL_ANSWERS
+
+
+def test_docstrings_begin_with_a_capital_or_a_symbol():
+    """A docstring begins with a capital, unless it begins with a symbol, a name or a call: these keep their case."""
+    found = []
+    for docstring in docstrings.all_docstrings():
+        word = re.match(r"[a-z]\w*", docstring.text)
+        is_name = word and (re.search(r"[_\d]", word[0]) or re.match(r"[('^/.\[]", docstring.text[word.end() :]))
+        if word and not is_name and not SYMBOL.match(docstring.text) and word[0] not in parameters(docstring.owner):
+            found.append(f"{docstring.place}: {word[0]}")
+    assert found == []
+
+
+def test_symbols_keep_their_case():
+    """A sentence that begins with a symbol does not change its case: `v + dt a`, not `V + dt a`. How a symbol is written is taken from
+    the rest of the docstring and the parameters, else from the other docstrings of the file, but for their first words.
+    """
+    found = []
+    for docstring in docstrings.all_docstrings():
+        elsewhere = {word for other in docstrings.of_file(docstring.path) for word in words(re.sub(r"\A\W*\w+", "", other.text))}
+        for symbol, rest in first_symbols(docstring.text):
+            nearby = words(rest) | parameters(docstring.owner)
+            other = symbol[0].swapcase() + symbol[1:]
+            known = nearby if {symbol, other} & nearby else elsewhere
+            if other in known and symbol not in known:
+                found.append(f"{docstring.place}: {symbol}, elsewhere {other}")
+    assert found == []
+
+
+def first_symbols(text: str) -> list[tuple[str, str]]:
+    """The symbols with which sentences begin, each with the text without it."""
+    found = []
+    for start in SENTENCE.finditer(text):
+        symbol = SYMBOL.match(text, start.end())
+        if symbol and not (symbol[0] in ("A", "I") and not re.match(r" [-+*/] ", text[symbol.end() :])) and symbol[0] != "Do":
+            found.append((symbol[0], text[: symbol.start()] + text[symbol.end() :]))
+    return found
+
+
+def words(text: str) -> set[str]:
+    """Every word and symbol in a text."""
+    return set(re.findall(r"[A-Za-z]\w*", text))
+
+
+def parameters(owner: docstrings.Owner) -> set[str]:
+    """Names of a function's parameters; none of a class or a file."""
+    if not isinstance(owner, ast.FunctionDef | ast.AsyncFunctionDef):
+        return set()
+    return {argument.arg for argument in (*owner.args.posonlyargs, *owner.args.args, *owner.args.kwonlyargs)}

@@ -54,6 +54,9 @@ def replace(
         mass: of the system's nodes [kg]: a number, or (N,) in the user's order.
         effect: index of the force that is meant, where several have the field.
 
+    Returns:
+        A system of the same kind.
+
     Raises:
         ValueError: no force or several forces with such a field, or a value that the constructor refuses.
 

@@ -98,6 +98,9 @@ def check_gradient(loss: Callable[[PyTree], Any], parameters: PyTree, seed: int 
     Returns:
         A `GradientCheck`; `print` it for a table. Nothing is raised for a wrong gradient.
 
+    Raises:
+        TypeError: a loss that is no function.
+
     >>> print(check_gradient(lambda p: jnp.sum(p**3), jnp.ones(4)).error < 1e-9)
     True
     """

@@ -79,6 +79,17 @@ class ImplicitStepper(Stepper):
         stiffness: Linearisation | None = None,
         adjoint: ExactSolver | None = None,
     ):
+        """Check that the options fit together.
+
+        Args:
+            solver: for the linear systems; `JaxCG()` unless said.
+            newton: True or a `Newton` for converged steps, False for one linear solve per step; None is the method's own choice.
+            stiffness: what stands for K in the single linear solve; `Tangent()` unless said.
+            adjoint: solver of the derivatives of Newton's steps; `ExactSolver()` unless said.
+
+        Raises:
+            ValueError: `stiffness` with Newton's method, or `adjoint` without.
+        """
         self.solver = JaxCG() if solver is None else solver
         wanted = self.is_newton_by_default() if newton is None else newton
         self.newton = Newton() if wanted is True else (wanted or None)

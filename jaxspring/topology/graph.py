@@ -36,6 +36,9 @@ class Graph(Topology):
         reduction: how pulls are summed on nodes.
         box: (D,) period of each coordinate [m], or None.
         triangles: (T, 3) triangles in the user's numbering, or None.
+        count: N (static).
+        nodes: the user's order of the nodes and the graph's own (static).
+        springs: the user's order of the springs and the graph's own (static).
         digest: of the springs in the user's numbering and order (static).
         name: tells it from other nets of the same springs, or None: see `named`.
     """

@@ -1,8 +1,14 @@
-"""What docstrings say: an answer with its question, symbols in their own case."""
+"""What docstrings say: an answer with its question, symbols in their own case, every argument, result and error of a public name."""
 
 import ast
+import enum
+import inspect
 import re
+import textwrap
 
+import pytest
+
+import jaxspring as js
 from tests import docstrings
 
 GREEK = "alpha beta gamma delta epsilon zeta eta theta kappa lambda mu nu xi rho sigma tau phi chi psi omega"
@@ -10,6 +16,11 @@ LETTERS = "|".join(["[A-Za-z]", "[dD][A-Za-z]", *GREEK.split(), *GREEK.title().s
 SYMBOL = re.compile(rf"(?:{LETTERS})(?:_\w+)?(?![\w-])")
 # Where a sentence begins: at the top, after a paragraph, after another sentence.
 SENTENCE = re.compile(r"\A|(?<=\n\n)|(?<=[a-z)\]]\. )")
+FUNCTIONS = [name for name in js.__all__ if inspect.isroutine(getattr(js, name))]
+# An exception and an enumeration are not built from arguments.
+CLASSES = [name for name in js.__all__ if inspect.isclass(getattr(js, name)) and not issubclass(getattr(js, name), Exception | enum.Enum)]
+
+
 # Classes that are being written anew elsewhere: take a name out when it fails.
 STILL_ANSWERS = {"Floor.obstacles", "Fluid.is_rule", "Fluid.can_feed", "Heat.sets_temperature"}
 
@@ -69,3 +80,35 @@ def parameters(owner: docstrings.Owner) -> set[str]:
     if not isinstance(owner, ast.FunctionDef | ast.AsyncFunctionDef):
         return set()
     return {argument.arg for argument in (*owner.args.posonlyargs, *owner.args.args, *owner.args.kwonlyargs)}
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_public_functions_say_what_they_take_return_and_raise(name):
+    """Under `Args:` stands every parameter, under `Returns:` what comes back, under `Raises:` every error that its own body raises."""
+    function = getattr(js, name)
+    text, signature = inspect.getdoc(function) or "", inspect.signature(function)
+    assert set(signature.parameters) == entries(text, "Args")
+    assert bool(section(text, "Returns").strip()) == (signature.return_annotation not in ("None", None))
+    body = ast.parse(textwrap.dedent(inspect.getsource(inspect.unwrap(function))))
+    raised = {ast.unparse(node.exc).split("(")[0] for node in ast.walk(body) if isinstance(node, ast.Raise) and node.exc}
+    assert raised <= entries(text, "Raises")
+
+
+@pytest.mark.parametrize("name", CLASSES)
+def test_public_classes_say_what_they_are_built_from(name):
+    """Every parameter of a constructor stands under `Attributes:` or `Args:`, of the class or of the constructor."""
+    cls = getattr(js, name)
+    texts = [inspect.cleandoc(text or "") for text in (cls.__doc__, cls.__init__.__doc__)]
+    told = {entry for text in texts for title in ("Attributes", "Args") for entry in entries(text, title)}
+    assert set(inspect.signature(cls).parameters) - told == set()
+
+
+def section(text: str, title: str) -> str:
+    """The lines under a title, up to the next line that is not indented."""
+    found = re.search(rf"^{title}:\n((?:[ ]{{4}}.*\n|\n)*)", text + "\n", flags=re.M)
+    return textwrap.dedent(found[1]) if found else ""
+
+
+def entries(text: str, title: str) -> set[str]:
+    """The names that stand under a title, as `name:` or `name, other:`."""
+    return {name for line in re.findall(r"^(\w+(?:, \w+)*): ", section(text, title), flags=re.M) for name in line.split(", ")}

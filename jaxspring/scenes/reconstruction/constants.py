@@ -182,6 +182,9 @@ def fit_constants(
         resume: go on from the checkpoint.
         progress: shows a bar.
 
+    Returns:
+        Meshes of the law before and after, errors under both rules, stiffnesses (E,) [N/m], and the fit.
+
     Raises:
         ValueError: a name that is not in `NAMES`, or none.
     """

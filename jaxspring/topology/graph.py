@@ -65,7 +65,7 @@ class Graph(Topology):
             n_nodes: number of nodes N; a node without a spring is allowed.
             box: (D,) period of each coordinate [m]; zero where a coordinate is not periodic.
             triangles: (T, 3) triangles, kept for plots and surfaces.
-            reduction: `Gather` (no scatter in any program) or `Scatter`, which compiles sooner; see docs/benchmarks.md for their speed.
+            reduction: `Gather` (no scatter in any program) or `Scatter`, which compiles sooner; see `docs/benchmarks.md` for their speed.
                 None takes `Gather`, but `Scatter` on a CPU for more nodes than `FASTER_BY_SCATTER`.
 
         Raises:

@@ -9,7 +9,7 @@ import textwrap
 import pytest
 
 import jaxspring as js
-from tests import docstrings
+from tests import docstrings, references
 
 GREEK = "alpha beta gamma delta epsilon zeta eta theta kappa lambda mu nu xi rho sigma tau phi chi psi omega"
 LETTERS = "|".join(["[A-Za-z]", "[dD][A-Za-z]", *GREEK.split(), *GREEK.title().split()])
@@ -101,6 +101,19 @@ def test_public_classes_say_what_they_are_built_from(name):
     texts = [inspect.cleandoc(text or "") for text in (cls.__doc__, cls.__init__.__doc__)]
     told = {entry for text in texts for title in ("Attributes", "Args") for entry in entries(text, title)}
     assert set(inspect.signature(cls).parameters) - told == set()
+
+
+def test_sections_name_what_there_is():
+    """In all code: under `Args:` stand the parameters, every one and no other; under `Attributes:` what the class has."""
+    wrong = []
+    for docstring in docstrings.all_docstrings():
+        if isinstance(docstring.owner, ast.ClassDef):
+            unknown = entries(docstring.text, "Attributes") - references.members(docstring.owner.name)
+        else:
+            told, taken = entries(docstring.text, "Args"), parameters(docstring.owner) - {"self", "cls"}
+            unknown = told ^ taken if told else set()
+        wrong += [f"{docstring.place}: {name}" for name in sorted(unknown)]
+    assert wrong == []
 
 
 def section(text: str, title: str) -> str:

@@ -32,7 +32,7 @@ def hops() -> dict[str, int]:
 
 
 def defined(path: str) -> set[str]:
-    """Names that a file defines: functions, classes, constants, and what stands in a class as `Class.name`."""
+    """Names that a file defines: functions, classes, constants, and what stands in a class, after its name and a dot."""
     found = set()
 
     def note(body: list[ast.stmt], before: str) -> None:

@@ -44,7 +44,7 @@ def load(name: str) -> Any | None:
 
 
 def jax_md(points: np.ndarray, speeds: np.ndarray, reach: float, skin: float) -> Peer | None:
-    """jax-md's dense neighbour list and its own pair sum, forces by its gradient; open space."""
+    """The dense neighbour list of jax-md and its own pair sum, forces by its gradient; open space."""
     if load("jax_md") is None:
         return None
     partition, space = (importlib.import_module(f"jax_md.{part}") for part in ("partition", "space"))

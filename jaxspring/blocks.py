@@ -3,7 +3,7 @@
     few frames    frame = blocks of b steps              frames x scan(blocks) x scan(steps)
     many frames   block = g frames of s steps each       scan(blocks) x scan(frames) x scan(steps)
 
-A block and a step inside it are rematerialised: the backward pass runs each block forward once more.
+A block and a step inside it are rematerialised: the backward pass runs each block forward once more, and each step in it once more.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Inspect = Callable[[Carry, Status], Status]
 
 
 class Checkpointed(eqx.Module):
-    """Reverse mode in O(sqrt T) memory, for one more forward run. The default.
+    """Reverse mode in O(sqrt T) memory that computes each step three times in all. The default.
 
     Attributes:
         block: steps in a block; None takes about sqrt(n_steps).
@@ -121,7 +121,7 @@ def run_blocks(
         return carry, status if plan.check_every else inspect(carry, status)
 
     def stretch(pair: Pair, n: int) -> Pair:
-        """N steps, in blocks."""
+        """n steps, in blocks."""
         whole, rest = divmod(n, plan.block)
         if whole == 1:
             pair = block(pair, plan.block)

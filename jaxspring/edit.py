@@ -40,6 +40,9 @@ def replace(system: System, *, mass: Numbers | None = None, effect: int | None =
         effect: index of the part that is meant, forces first and then rules, where several take the constant.
         constants: new values, by name, in the units that the constructors take.
 
+    Returns:
+        A system of the same kind.
+
     Raises:
         ValueError: no part or several parts with such a constant, or a value that the constructor refuses.
 

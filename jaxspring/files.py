@@ -58,6 +58,9 @@ def load(path: Path, like: PyTree = None) -> PyTree:
         like: a tree of the same structure, shapes and types, such as a freshly built system; its numbers are replaced.
             None returns a plain dictionary, name -> NumPy array.
 
+    Returns:
+        A tree as `like`, with the numbers of the file.
+
     Raises:
         CheckpointError: the file is damaged or of another version, or does not fit `like`; both sides are named.
         OSError: there is no such file.

@@ -18,7 +18,7 @@ from .topology.periods import box_of, check_dim, nearest_image
 
 
 def lumped_mass(net: Topology, points: Numbers, density: Numbers, triangles: Numbers | None = None) -> Array:
-    """(N,) node masses [kg] from a density, in the user's order.
+    """Node masses from a density.
 
     Along springs (density [kg/m]) each spring gives half its mass to either end. With triangles (density [kg/m^2]) each triangle gives
     a third to each corner.
@@ -28,6 +28,9 @@ def lumped_mass(net: Topology, points: Numbers, density: Numbers, triangles: Num
         points: (N, D) rest positions [m].
         density: one number.
         triangles: (T, 3) node numbers, or None for a density along springs.
+
+    Returns:
+        (N,) [kg], in the user's order.
 
     Raises:
         ValueError: a density that is not positive, points of another number, a triangle that names a node that does not exist.

@@ -71,7 +71,11 @@ def normal_modes(system: System, state: State, n_modes: int | None = None) -> Mo
         n_modes: how many, the lowest; None is all: the number of free coordinates. Where the system is an argument of `jit` and that
             number is not known, the modes beyond it have an infinite frequency and no shape.
 
+    Returns:
+        The modes, the lowest frequency first.
+
     Raises:
+        TypeError: an `n_modes` that is no whole number.
         ValueError: more modes than free coordinates; a dF/dx that is not symmetric (under `jit` the frequencies are NaN then); a large
             system without `n_modes`, under a transformation, or with a force that does not name all its `stiffness_blocks`.
 

@@ -262,7 +262,7 @@ def _as_state(time: Array, y: Y, scene: _Scene) -> State:
 
 
 def _flow(time: Any, y: Any, scene: Any) -> Any:
-    """Dy/dt. Module-level, so that diffrax compiles it once."""
+    """dy/dt. Module-level, so that diffrax compiles it once."""
     state = _as_state(time, y, scene)
     return state.velocity, scene.system.acceleration(state)
 

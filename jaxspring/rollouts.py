@@ -1,7 +1,7 @@
 """Fixed steps in time: `rollout`.
 
 The steps run in blocks of about sqrt(n_steps), a scan of scans, both levels rematerialised in reverse mode: the memory of a gradient
-grows with the square root of the number of steps, and costs one more forward run. Status is taken once per block: NaN is sticky, so a
+grows with the square root of the number of steps, and costs two more forward runs. Status is taken once per block: NaN is sticky, so a
 run that failed is replayed to find the step. Time is exact: t = t0 + i dt.
 """
 

@@ -205,6 +205,13 @@ def raise_for_status(result: Any) -> None:
     """Raise `SimulationError` where `result` (or a `Status`) holds an error; warn where it holds a warning only.
 
     Inside `jit` a status is a traced value: return it and call this outside.
+
+    Args:
+        result: what a public function returned, or the status itself.
+
+    Raises:
+        SimulationError: an error was raised.
+        TypeError: a status that is traced.
     """
     status = result if isinstance(result, Status) else result.status
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(status)):

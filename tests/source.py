@@ -1,6 +1,7 @@
 """The library's source files as the tests of its layout read them: paths, names and syntax trees."""
 
 import ast
+import functools
 import pathlib
 import sys
 
@@ -16,8 +17,9 @@ def files() -> list[pathlib.Path]:
     return found
 
 
+@functools.cache
 def tree(path: pathlib.Path) -> ast.Module:
-    """The syntax tree of a file."""
+    """The syntax tree of a file, read once: not to be changed."""
     return ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
 
 

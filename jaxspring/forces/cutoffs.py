@@ -7,7 +7,7 @@ With F = w r the law's force, U its potential, and c the radius:
     switched        F S - (U - U(c)) S'       potential (U - U(c)) S(r)                S falls from 1 to 0 between r_on and c; r_0 stays
 
 Every potential is continuous and zero at c and beyond, so that its gradient is minus the force. What a cut-off leaves out is not small for
-the slides' law, whose force falls as 1/r only: see docs/fluid.md.
+the slides' law, whose force falls as 1/r only: see `docs/fluid.md`.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class NoCutoff(Cutoff):
 
     @property
     def reach(self) -> None:
-        """None."""
+        """No distance: the law has no end."""
         return None
 
     def weight(self, law: PairLaw, squared: Array) -> Array:

@@ -53,29 +53,29 @@ class Drag(Force):
         return -(self._gamma(state) * state.velocity)
 
     def damping_blocks(self, state: State) -> Blocks:
-        """Gamma on the diagonal [N s/m]."""
+        """gamma on the diagonal [N s/m]."""
         return Blocks((isotropic(self._gamma(state), state.position),))
 
     def incremental_potential(self, state: State, dt: Array) -> Array:
-        """Dt gamma v^2 / 2, summed [J]."""
+        """dt gamma v^2 / 2, summed [J]."""
         return jnp.sum(0.5 * dt * self._gamma(state).astype(state.dtype) * state.velocity.dot(state.velocity))
 
     @property
     def is_symmetric(self) -> bool:
-        """Always: drag acts on each coordinate alone."""
+        """Whether -dF/dv is symmetric: drag acts on each coordinate alone."""
         return True
 
     @property
     def can_feed(self) -> bool:
-        """Never: drag takes energy out."""
+        """Whether the force can raise the energy: drag takes energy out."""
         return False
 
     def damping_bound(self, state: State) -> Array:
-        """Gamma [N s/m]."""
+        """gamma [N s/m]."""
         return self._gamma(state).astype(state.dtype)
 
     def damping_floor(self, state: State) -> Array:
-        """Gamma [N s/m]."""
+        """gamma [N s/m]."""
         return self._gamma(state).astype(state.dtype)
 
     def invalid(self) -> Array:
@@ -155,7 +155,7 @@ class Dashpots(Force):
 
     @property
     def can_feed(self) -> bool:
-        """Never: a damper takes energy out."""
+        """Whether the force can raise the energy: a damper takes energy out."""
         return False
 
     def damping_bound(self, state: State) -> Array | None:

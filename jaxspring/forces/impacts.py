@@ -23,7 +23,7 @@ at most; a node that would go on longer waits at its last impact, and is counted
 A node that begins a step below a plane counts from where it is. What is held does not take part. Forces that depend on velocity change
 at an impact: M^-1 (F(v + J) - F(v)) acts for the time r, on every node that they reach.
 
-Source: events in a step as in Hairer, Norsett and Wanner (1993), II.6; the numbers it was tried on are in docs/physics.md.
+Source: events in a step as in Hairer, Norsett and Wanner (1993), II.6; the numbers it was tried on are in `docs/physics.md`.
 """
 
 from __future__ import annotations

@@ -41,7 +41,7 @@ class ExactTangent(Linearisation):
     """The tangent stiffness as it is."""
 
     def block(self, weight: Array, slope: Array) -> tuple[Array, Array]:
-        """Unchanged."""
+        """Weight and slope as they are."""
         return weight, slope
 
 

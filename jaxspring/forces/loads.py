@@ -119,5 +119,5 @@ class Load(Force):
 
     @property
     def is_symmetric(self) -> bool:
-        """Always: a load does not depend on the position."""
+        """Whether -dF/dx is symmetric: a load does not depend on position."""
         return True

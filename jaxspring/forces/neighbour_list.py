@@ -89,7 +89,7 @@ class NeighbourList(Pairs):
 
     @property
     def needs_reach(self) -> bool:
-        """Yes."""
+        """Whether the law must have a cut-off: a list holds the pairs within one."""
         return True
 
     def begin(self, position: Fields, reach: Array | None, box: Array | None = None) -> NeighbourMemory:

@@ -211,7 +211,7 @@ class LennardJones(PairLaw):
 
     @property
     def uses_mass(self) -> bool:
-        """No."""
+        """Whether both masses multiply the law: epsilon alone says how strong it is."""
         return False
 
     def weight(self, squared: Array) -> Array:
@@ -249,6 +249,12 @@ def gentle_fluid(spacing: Numbers, zeta: Numbers = 0.0, alpha: Numbers = 1.0) ->
         spacing: h [m], the length of the lattice's structural springs.
         zeta: length that softens the attraction [m].
         alpha: attraction [N m / kg^2]; it sets how strongly the fluid holds together.
+
+    Returns:
+        The law with this beta [N m^3 / kg^2].
+
+    Raises:
+        ValueError: a spacing or an attraction that is not positive, or a negative zeta.
 
     >>> round(float(gentle_fluid(spacing=0.5, zeta=0.1).equilibrium_distance), 6)
     0.5

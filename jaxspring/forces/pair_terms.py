@@ -60,7 +60,7 @@ class Particles(eqx.Module):
     velocity: Fields
 
     def fields(self) -> Fields:
-        """All of them in one tuple."""
+        """All arrays in one tuple, as `arrangement` orders them."""
         extra = tuple(a for a in (self.charge, self.fluid) if a is not None)
         return (*self.position, *extra, *self.velocity)
 

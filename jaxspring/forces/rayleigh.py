@@ -117,7 +117,7 @@ class Rayleigh(Force):
 
     @property
     def can_feed(self) -> bool:
-        """Never: both terms take energy out."""
+        """Whether the force can raise the energy: both terms take energy out."""
         return False
 
     def damping_bound(self, state: State) -> Array:

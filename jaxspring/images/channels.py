@@ -20,7 +20,11 @@ _BEYOND = 3.4e38
 
 
 class Channel(eqx.Module):
-    """Take one channel of a colour image by its index: 0, 1, 2 are red, green, blue; of two channels, 0 is grey and 1 is opacity."""
+    """Take one channel of a colour image by its index.
+
+    Attributes:
+        index: 0, 1, 2 are red, green, blue; of two channels, 0 is grey and 1 is opacity (static).
+    """
 
     index: int = eqx.field(static=True)
 

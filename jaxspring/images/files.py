@@ -43,8 +43,19 @@ def image_from_array(
 ) -> Image:
     """An `Image` from a NumPy array `(ny, nx)`, or `(ny, nx, n_channels)` with a `channel` that says which grey to take.
 
-    `fill` replaces pixels that are masked (in a masked array), NaN or infinite; without it they are an error. `spacing`, `origin` [m] and
-    errors as in `Image`.
+    Args:
+        pixels: the array, of any real type.
+        channel: `Luminance()`, `Channel(index)`, or None for an array of one channel.
+        spacing: distance between pixels [m], as in `Image`.
+        origin: position of the first pixel [m], as in `Image`.
+        fill: number to put where a pixel is masked (in a masked array), NaN or infinite; without it such an array is refused.
+
+    Returns:
+        The image, its pixels in the unit of the array.
+
+    Raises:
+        ValueError: a shape without a channel that fits, pixels without a value and no `fill`; else as `Image`.
+        TypeError: traced pixels, or pixels of a type that `Image` refuses.
 
     >>> import numpy as np
     >>> print(image_from_array(np.ones((2, 2, 3)), Luminance()).values[0])
@@ -86,6 +97,9 @@ def load_image(
         fill: number to put where a pixel has no value, is NaN or infinite; without it such a file is refused.
         max_pixels: larger images are refused before they are decoded.
 
+    Returns:
+        The image, its pixels in the unit of the file.
+
     Raises:
         ImageError: the file cannot be used; one line says why.
         ImportError: it is not a NumPy file, and Pillow (or tifffile, for TIFF) is not installed.
@@ -107,7 +121,13 @@ def load_image(
 def elevation_model(spacing: PerAxis = 1.0) -> Image:
     """The elevation model that ships with matplotlib: Jacksboro fault, Tennessee, 344 x 403 heights [m] from 236 to 1076.
 
-    One pixel is 1/1200 degree, about 74 m along x and 93 m along y; `spacing` is 1 (pixels) unless given.
+    One pixel is 1/1200 degree, about 74 m along x and 93 m along y.
+
+    Args:
+        spacing: distance between pixels, as in `Image`: 1 (pixels) unless given; (74.0, 93.0) is in metres.
+
+    Returns:
+        The image, `(344, 403)` heights [m].
 
     Raises:
         ImportError: matplotlib is not installed.

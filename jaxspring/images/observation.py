@@ -41,15 +41,28 @@ def image_gradient(image: Image) -> tuple[Array, Array]:
 
 @_one_program
 def gradient_magnitude(image: Image) -> Array:
-    """|grad d| at the pixels, `(ny, nx)` [image unit per m]. Where the gradient is zero its derivative is taken as zero, not NaN."""
+    """|grad d| at the pixels. Where the gradient is zero its derivative is taken as zero, not NaN.
+
+    Args:
+        image: d.
+
+    Returns:
+        `(ny, nx)` [image unit per m].
+    """
     return _norm(*image_gradient(image))
 
 
 @_one_program
 def principal_curvatures(image: Image) -> tuple[Array, Array]:
-    """Larger and smaller principal curvature of the surface z = image, each `(ny, nx)` [1/m], with pixels in the unit of the spacing.
+    """Principal curvatures of the surface z = image, with pixels in the unit of the spacing.
 
     Second differences; on the border, those of the nearest inner pixel. A scaled image is another surface: normalise grey levels first.
+
+    Args:
+        image: the height z over the plane.
+
+    Returns:
+        The larger and the smaller curvature, each `(ny, nx)` [1/m].
     """
     dx, dy = image_gradient(image)
     sx, sy = image.spacing
@@ -108,7 +121,7 @@ class Combined(Observation):
 
     Attributes:
         observations: tuple of observations (or functions of an image).
-        weights: one weight each, in a unit that makes the terms alike.
+        weights: one number each, in a unit that makes the terms alike.
 
     >>> import numpy as np
     >>> both = Combined((GradientMagnitude(), Curvature()), (1.0, 0.5))
@@ -141,10 +154,23 @@ def adaptation(
     observation: Callable[[Image], Array] = GradientMagnitude(),  # noqa: B008 (frozen, holds no array)
     radius: int | None = None,
 ) -> Image:
-    """The observation smoothed by a Gaussian of `sigma` [m] and scaled to [0, 1] by its maximum: an `Image` to be sampled at the nodes.
+    """The observation smoothed by a Gaussian and scaled to [0, 1] by its maximum: an image to be sampled at the nodes.
 
-    An observation that is negative somewhere is first shifted so that its minimum is 0. Where there is nothing to see (a constant image)
-    the result is 0 everywhere, and its derivatives are finite. `radius` as in `smooth`: needed where sigma is traced.
+    An observation that is negative somewhere is first shifted so that its minimum is 0.
+
+    Args:
+        image: what is observed.
+        sigma: standard deviation of the Gaussian [m]; 0 smooths nothing.
+        observation: from an image to `(ny, nx)`, in any unit.
+        radius: of the Gaussian, as in `smooth` [pixels]: needed where sigma is traced.
+
+    Returns:
+        An image of the same spacing, without unit. Where there is nothing to see (a constant image) it is 0 everywhere, and its
+        derivatives are finite.
+
+    Raises:
+        ValueError: a sigma or radius that `smooth` refuses, or an observation of another shape.
+        TypeError: a traced sigma without a radius.
 
     >>> import numpy as np
     >>> step = Image(np.tile([0.0, 0.0, 0.0, 5.0, 5.0, 5.0], (4, 1)))

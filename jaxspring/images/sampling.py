@@ -61,7 +61,7 @@ class Bilinear(Sampling):
         return 1 - t, t
 
     def slopes(self, t: Array) -> tuple[Array, ...]:
-        """`(-1, 1)`."""
+        """Derivatives of the two weights by `t`: `(-1, 1)` wherever `t` is."""
         one = jnp.ones_like(t)
         return -one, one
 
@@ -91,7 +91,7 @@ class CubicSpline(Sampling):
         return s * s * s / 6, (4 - 3 * t * t * (1 + s)) / 6, (4 - 3 * s * s * (1 + t)) / 6, t * t * t / 6
 
     def slopes(self, t: Array) -> tuple[Array, ...]:
-        """Their derivatives."""
+        """Derivatives of the four pieces by `t`."""
         s = 1 - t
         return -s * s / 2, t * (3 * t - 4) / 2, s * (4 - 3 * s) / 2, t * t / 2
 

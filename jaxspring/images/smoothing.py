@@ -30,12 +30,18 @@ _IDENTITY_DEVIATION = math.sqrt(1 / 160)
 
 
 def smooth(image: Image, sigma: Length, radius: int | None = None) -> Image:
-    """The image convolved with a Gaussian of standard deviation `sigma` [m]; sigma = 0 gives the image itself.
+    """The image convolved with a Gaussian.
 
-    `radius` is the number of pixels kept on each side of the kernel's centre. Left out, it is four standard deviations, which needs a sigma
-    and a spacing that are known while tracing. With a sigma that is traced (inside `jit` or `grad`), pass the radius for the largest sigma
-    that can occur: `smoothing_radius(largest_sigma, image.spacing)`. Should sigma exceed half the radius all the same, the kernel would
-    no longer be a Gaussian, and every pixel is NaN instead.
+    Args:
+        image: what is smoothed.
+        sigma: standard deviation [m], one number; 0 gives the image itself.
+        radius: pixels kept on each side of the kernel's centre. Left out, it is four standard deviations, which needs a sigma and a
+            spacing that are known while tracing. With a sigma that is traced (inside `jit` or `grad`), pass the radius for the largest
+            sigma that can occur: `smoothing_radius(largest_sigma, image.spacing)`.
+
+    Returns:
+        An image of the same shape, spacing and unit. Should a traced sigma exceed half the radius, the kernel would no longer be a
+        Gaussian, and every pixel is NaN instead.
 
     Raises:
         ValueError: sigma negative, NaN or infinite; radius negative, or under two standard deviations.
@@ -70,7 +76,18 @@ def smooth(image: Image, sigma: Length, radius: int | None = None) -> Image:
 
 
 def smoothing_radius(sigma: Length, spacing: Length | tuple[Length, Length] = 1.0, deviations: float = 4.0) -> int:
-    """Pixels on each side of the kernel's centre that hold `deviations` standard deviations `sigma` [m], on the axis of finer spacing [m].
+    """Pixels on each side of a Gaussian kernel's centre, on the axis of finer spacing.
+
+    Args:
+        sigma: standard deviation [m], a number that is known.
+        spacing: distance between pixels [m]: a number, or (along x, along y).
+        deviations: how many standard deviations the pixels are to hold.
+
+    Returns:
+        The number of pixels.
+
+    Raises:
+        ValueError: sigma negative, NaN or infinite.
 
     >>> smoothing_radius(1.6)
     7

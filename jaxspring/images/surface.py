@@ -29,6 +29,13 @@ class Surface(eqx.Module):
     The result has the floating type of the points, not of the pixels, so a float32 state stays float32. A coordinate that is NaN or
     infinite gives NaN, and so does everything where a traced spacing is not positive; any other coordinate
     outside is clamped, however far.
+
+    Attributes:
+        coefficients: what the weights of `method` multiply, an array of at least `(ny, nx)` [image unit].
+        spacing: distance between pixels along x and along y [m], two 0-d arrays.
+        origin: position (x, y) of the first pixel [m], two 0-d arrays.
+        shape: `(ny, nx)` (static).
+        method: how to read between pixels.
     """
 
     coefficients: Array

@@ -78,7 +78,7 @@ class GradientCheck:
         return float(np.max([leaf.error for leaf in self.leaves]))
 
     def __str__(self) -> str:
-        """A table."""
+        """The table: a row per leaf."""
         rows = [f"{'leaf':30} {'gradient':>14} {'differences':>14} {'error':>9} {'order':>6}"]
         for leaf in self.leaves:
             numbers = f"{leaf.gradient:14.6e} {leaf.difference:14.6e} {leaf.error:9.1e} {leaf.taylor_order:6.2f}"
@@ -97,6 +97,9 @@ def check_gradient(loss: Callable[[PyTree], Any], parameters: PyTree, seed: int 
 
     Returns:
         A `GradientCheck`; `print` it for a table. Nothing is raised for a wrong gradient.
+
+    Raises:
+        TypeError: a loss that is no function.
 
     >>> print(check_gradient(lambda p: jnp.sum(p**3), jnp.ones(4)).error < 1e-9)
     True

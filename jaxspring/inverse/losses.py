@@ -10,7 +10,17 @@ from .._checks import as_inexact, finite, shape_of
 
 
 def squared_distance(points: Array, target: ArrayLike) -> Array:
-    """Mean over the nodes of the squared distance between two sets of points (..., N, D) [m^2].
+    """Mean over the nodes of the squared distance between two sets of points.
+
+    Args:
+        points: (..., N, D) [m].
+        target: of the same shape [m].
+
+    Returns:
+        The mean [m^2], 0-d.
+
+    Raises:
+        ValueError: a target of another shape, or one that is not finite.
 
     >>> print(squared_distance(jnp.zeros((2, 3)), jnp.ones((2, 3))))
     3.0

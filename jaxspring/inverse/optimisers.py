@@ -274,7 +274,7 @@ class _Units(eqx.Module):
         return jax.tree.map(lambda p, u: p / u, free, self.free)
 
     def outward(self, scaled: PyTree) -> PyTree:
-        """And back."""
+        """Parameters in their own units again."""
         return jax.tree.map(lambda p, u: p * u, scaled, self.free)
 
     def objective(self, objective: Objective) -> Objective:

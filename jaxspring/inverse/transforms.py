@@ -71,11 +71,11 @@ class Positive(Transform):
     """
 
     def constrain(self, free: Array) -> Array:
-        """The exponential."""
+        """The value exp(u) of the number u."""
         return jnp.exp(free)
 
     def free(self, value: Array) -> Array:
-        """The logarithm."""
+        """The number log(value)."""
         return jnp.log(value)
 
     def allowed(self, value: np.ndarray) -> np.ndarray:
@@ -144,7 +144,7 @@ class Bounded(Transform):
         return jnp.log(value - self.low) - jnp.log(self.high - value)
 
     def allowed(self, value: np.ndarray) -> np.ndarray:
-        """Strictly inside."""
+        """Strictly between the bounds."""
         return (value > self.low) & (value < self.high)
 
     @property

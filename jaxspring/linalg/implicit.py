@@ -33,7 +33,7 @@ class ImplicitProblem(eqx.Module):
 
     @abc.abstractmethod
     def residual(self, theta: PyTree, y: PyTree, /) -> PyTree:
-        """R, of the structure of y."""
+        """r(theta, y), of the structure of y."""
 
     @abc.abstractmethod
     def solve_linearised(self, theta: PyTree, y: PyTree, right_side: PyTree, /) -> PyTree:

@@ -214,7 +214,7 @@ def _select(condition: Array, a: PyTree, b: PyTree) -> PyTree:
 
 
 def identity(r: PyTree) -> PyTree:
-    """No preconditioner."""
+    """What stands for a preconditioner where there is none."""
     return r
 
 

@@ -155,7 +155,7 @@ class LatticeLevel(Level):
         return r.map(lambda a: restrict(a, self.axes))
 
     def prolong(self, v: Vector) -> Vector:
-        """Linear interpolation."""
+        """Linear interpolation between the nodes of the next level."""
         return v.map(lambda a: prolong(a, self.axes))
 
 

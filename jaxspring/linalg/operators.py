@@ -94,7 +94,7 @@ class NodeDyads(eqx.Module):
     direction: Vector
 
     def product(self, v: Vector) -> Vector:
-        """S g (g . v)."""
+        """s g (g . v)."""
         return (self.slope * self.direction.dot(v)) * self.direction
 
     def scaled(self, factor: Any) -> NodeDyads:

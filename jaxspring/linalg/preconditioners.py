@@ -40,7 +40,7 @@ class Jacobi(Preconditioner):
     """Division by the diagonal: makes up for stiffnesses and masses of very different size."""
 
     def build(self, matrix: SpringMatrix) -> Map:
-        """R -> r over the diagonal's magnitude (1 where that is zero)."""
+        """The map r -> r over the diagonal's magnitude (1 where that is zero)."""
         inverse = matrix.diagonal().map(lambda a: 1 / _or_one(jnp.abs(a)))
         return lambda r: r.map(lambda a, b: a * b, inverse)
 
@@ -49,7 +49,7 @@ class BlockJacobi(Preconditioner):
     """Solves with every node's own D x D block: Jacobi that also knows the directions of the springs at a node."""
 
     def build(self, matrix: SpringMatrix) -> Map:
-        """R -> the solution with each node's block; with the diagonal alone where the coordinates decouple."""
+        """The map r -> the solution with each node's block; with the diagonal alone where the coordinates decouple."""
         if matrix.is_scalar:
             return Jacobi().build(matrix)
         return BlockFactors.of(matrix.node_blocks()).solve

@@ -36,7 +36,7 @@ class ForwardEuler(Stepper):
     """Forward Euler: unstable for undamped springs at every dt; here for contrast."""
 
     def step(self, system: BoundSystem, state: State, dt: Array, memory: None) -> tuple[State, None]:
-        """X + dt v, v + dt a."""
+        """x + dt v, v + dt a."""
         a = system.acceleration(state)
         return state.moved(state.position + dt * state.velocity, state.velocity + dt * a), None
 
@@ -49,7 +49,7 @@ class SymplecticEuler(Stepper):
     """Symplectic (semi-implicit) Euler, kick then drift: the slides' update."""
 
     def step(self, system: BoundSystem, state: State, dt: Array, memory: None) -> tuple[State, None]:
-        """V + dt a, then x + dt of the new v."""
+        """v + dt a, then x + dt of the new v."""
         v = state.velocity + dt * system.acceleration(state)
         return state.moved(state.position + dt * v, v), None
 
@@ -88,7 +88,7 @@ class RungeKutta4(Stepper):
     """The classical Runge-Kutta method of order 4: four evaluations of the forces in a step."""
 
     def step(self, system: BoundSystem, state: State, dt: Array, memory: None) -> tuple[State, None]:
-        """X and v by four stages."""
+        """x and v by four stages."""
 
         def slope(fraction: float, dx: Vector | None, dv: Vector | None) -> tuple[Vector, Vector]:
             if dx is None or dv is None:
@@ -115,6 +115,6 @@ class RungeKutta4(Stepper):
 
 
 def _ratio(a: Array, b: Array) -> Array:
-    """A / b, infinite where b is zero."""
+    """a / b, infinite where b is zero."""
     is_zero = b == 0
     return jnp.where(is_zero, jnp.full_like(b, jnp.inf), a / jnp.where(is_zero, jnp.ones_like(b), b))

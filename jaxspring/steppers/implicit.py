@@ -79,6 +79,17 @@ class ImplicitStepper(Stepper):
         stiffness: Linearisation | None = None,
         adjoint: ExactSolver | None = None,
     ):
+        """Check that the options fit together.
+
+        Args:
+            solver: for the linear systems; `JaxCG()` unless said.
+            newton: True or a `Newton` for converged steps, False for one linear solve per step; None is the method's own choice.
+            stiffness: what stands for K in the single linear solve; `Tangent()` unless said.
+            adjoint: solver of the derivatives of Newton's steps; `ExactSolver()` unless said.
+
+        Raises:
+            ValueError: `stiffness` with Newton's method, or `adjoint` without.
+        """
         self.solver = JaxCG() if solver is None else solver
         wanted = self.is_newton_by_default() if newton is None else newton
         self.newton = Newton() if wanted is True else (wanted or None)
@@ -130,7 +141,7 @@ class ImplicitStepper(Stepper):
 
     @property
     def runs_backward(self) -> bool:
-        """No: backward in time the matrix is not positive definite."""
+        """Whether dt may be negative: backward in time the matrix is not positive definite."""
         return False
 
     def step(self, system: BoundSystem, state: State, dt: Array, memory: Memory) -> tuple[State, Memory]:
@@ -172,7 +183,7 @@ class BackwardEuler(ImplicitStepper):
 
     @classmethod
     def is_newton_by_default(cls) -> bool:
-        """No: one linear solve keeps order 1."""
+        """Whether the order needs converged steps: one linear solve keeps order 1."""
         return False
 
     def stage(self, system: BoundSystem, state: State, dt: Array, history: None) -> Stage:
@@ -194,7 +205,7 @@ class ImplicitMidpoint(ImplicitStepper):
 
     @classmethod
     def is_newton_by_default(cls) -> bool:
-        """Yes: the clamped tangent of a single solve would lower the order where springs are squeezed."""
+        """Whether the order needs converged steps: the clamped tangent of one solve would lower it where springs are squeezed."""
         return True
 
     def stage(self, system: BoundSystem, state: State, dt: Array, history: None) -> Stage:
@@ -202,7 +213,7 @@ class ImplicitMidpoint(ImplicitStepper):
         return _stage(system, state, state.position, state.velocity, 0.5 * dt, state.time + 0.5 * dt)
 
     def finish(self, state: State, dt: Array, stage: Stage, y: Vector) -> State:
-        """X + dt v*, 2 v* - v."""
+        """x + dt v*, 2 v* - v."""
         middle = stage.full(y)
         return state.moved(state.position + dt * middle, stage.system.hold(2 * middle - state.velocity), state.time + dt)
 
@@ -218,11 +229,11 @@ class BDF2(ImplicitStepper):
 
     @classmethod
     def is_newton_by_default(cls) -> bool:
-        """Yes: the clamped tangent of a single solve would lower the order where springs are squeezed."""
+        """Whether the order needs converged steps: the clamped tangent of one solve would lower it where springs are squeezed."""
         return True
 
     def first_history(self, state: State) -> tuple[Array, Vector, Vector]:
-        """No state before the first."""
+        """What stands for the state before the first: none, so that the first step is backward Euler's."""
         return jnp.zeros((), bool), state.position, state.velocity
 
     def remember(self, state: State) -> tuple[Array, Vector, Vector]:

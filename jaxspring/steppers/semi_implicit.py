@@ -60,7 +60,7 @@ class SemiImplicit(Stepper):
         return Memory(self.solver.init(kick.matrix()), nothing, None, None)
 
     def step(self, system: BoundSystem, state: State, dt: Array, memory: Memory | None) -> tuple[State, Memory | None]:
-        """V + dv, then x + dt of the new v."""
+        """v + dv, then x + dt of the new v."""
         kick = _Kick(system, state, dt)
         if memory is None:
             dv = kick.impulse().map(lambda impulse, a: impulse / a, kick.matrix().diagonal())
@@ -73,7 +73,7 @@ class SemiImplicit(Stepper):
 
     @property
     def runs_backward(self) -> bool:
-        """No: damping backward in time grows without bound."""
+        """Whether dt may be negative: damping backward in time grows without bound."""
         return False
 
     def report(self, memory: Memory | None) -> SolveInfo | None:
@@ -108,7 +108,7 @@ class _Kick(eqx.Module):
         return self.system.matrix(inertia + self.system.damping_blocks(self.state).scaled(self.dt), self.state)
 
     def impulse(self) -> Vector:
-        """Dt f at the old state [N s]."""
+        """dt f at the old state [N s]."""
         return self.dt * self.system.force(self.state)
 
     def known(self) -> Vector:

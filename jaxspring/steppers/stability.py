@@ -31,6 +31,9 @@ def stable_dt(system: System, state: State, stepper: Stepper | None = None) -> A
         state: where position-dependent bounds are taken.
         stepper: `SymplecticEuler()` unless said.
 
+    Returns:
+        dt [s], 0-d.
+
     Raises:
         TypeError: a stepper that does not know its limit.
 

@@ -130,7 +130,7 @@ class LinearStage(ImplicitProblem):
         return implicitly(self, stage, y), info, memory
 
     def _right_side(self, stage: Stage) -> Vector:
-        """B = M v0 / h + f_p + G v_p - K (x0 - x_p) [N]."""
+        """b = M v0 / h + f_p + G v_p - K (x0 - x_p) [N]."""
         at = stage.predictor
         b = (stage.system.mass.astype(at.dtype) / stage.h) * stage.velocity + stage.system.force(at)
         damping = stage.system.damping_blocks(at)

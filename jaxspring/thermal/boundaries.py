@@ -123,7 +123,7 @@ class FixedTemperature(ThermalBoundary):
         self.temperature = _given(net, "temperature", temperature)
 
     def held(self) -> Array:
-        """The nodes."""
+        """The nodes of given temperature."""
         return self.nodes
 
     def given(self, time: Array, temperature: Array) -> Array:
@@ -169,7 +169,7 @@ class HeatFlux(ThermalBoundary):
         return _there(self.nodes, at_time(self.flux, state.time, temperature) * self.area, temperature)
 
     def slope(self, state: State, temperature: Array) -> None:
-        """None: the flux does not look at the temperature."""
+        """No slope: the flux does not look at the temperature."""
 
     def invalid(self) -> Array:
         """Whether the area is negative or not finite."""

@@ -64,7 +64,7 @@ class EqualCells(Cells):
     """The same volume for every node."""
 
     def share(self, net: Lattice, axis: int) -> np.ndarray:
-        """One."""
+        """A full spacing for every node."""
         return np.ones(net.shape[axis])
 
 
@@ -83,7 +83,7 @@ class HalfCells(Cells):
 def capacities(
     net: Topology, density: Numbers, specific_heat: Numbers, spacing: Numbers, section: Numbers = 1.0, cells: Cells | None = None
 ) -> Array:
-    """(N,) heat capacities [J/K] of the nodes of a lattice, C = density * specific heat * volume, in the user's order.
+    """Heat capacities of the nodes of a lattice, C = density * specific heat * volume.
 
     Args:
         net: a lattice.
@@ -92,6 +92,9 @@ def capacities(
         spacing: [m]: a number, or one for x, y, z.
         section: thickness of a sheet [m], cross-section of a chain [m^2].
         cells: `EqualCells()` unless said. Take the same for `conductances`.
+
+    Returns:
+        (N,) [J/K], in the user's order.
 
     Raises:
         ValueError: a value or section that is not positive, a shape that does not fit, a net that is no lattice.

@@ -54,13 +54,16 @@ def harmonic_mean(net: Topology, value: Any, name: str = "value") -> EdgeField:
 
 
 def link_conductances(net: Topology, conductivity: Numbers, area: Numbers, length: Numbers) -> EdgeField:
-    """Conductances [W/K] of any net, as an edge field: c A / h with the harmonic mean of the ends' conductivities.
+    """Conductances of the springs of any net: c A / h with the harmonic mean of the ends' conductivities.
 
     Args:
         net: the topology.
         conductivity: [W/(m K)]: a number, or (N,) in the user's order; zero insulates.
         area: section of each spring [m^2]: a number, (E,) in the user's order, or an edge field.
         length: of each spring [m], as `area`.
+
+    Returns:
+        An edge field [W/K].
 
     Raises:
         ValueError: a conductivity that is negative or infinite, an area that is negative, a length that is not positive.
@@ -81,7 +84,7 @@ def link_conductances(net: Topology, conductivity: Numbers, area: Numbers, lengt
 
 
 def conductances(net: Topology, conductivity: Numbers, spacing: Numbers, section: Numbers = 1.0, cells: Cells | None = None) -> EdgeField:
-    """Conductances [W/K] of a lattice's springs, as an edge field.
+    """Conductances of a lattice's springs.
 
     With a scalar conductivity the structural springs conduct; all others get zero. With a tensor the diagonals of squares (SHEAR) conduct
     what it has off its diagonal.
@@ -93,6 +96,9 @@ def conductances(net: Topology, conductivity: Numbers, spacing: Numbers, section
         spacing: [m]: a number, or one for x, y, z.
         section: thickness of a sheet [m], cross-section of a chain [m^2].
         cells: `EqualCells()` unless said. Take the same for `capacities`.
+
+    Returns:
+        An edge field [W/K].
 
     Raises:
         ValueError: a negative or infinite conductivity; a section that is not one positive number; a tensor that is not symmetric, or

@@ -79,7 +79,7 @@ class Flow(eqx.Module):
         return self.latent.joined(temperature, taken_up, self.capacity)
 
     def temperature(self, y: Array) -> Array:
-        """Temperature [K]."""
+        """Temperature of the unknown y [K]."""
         return y if self.latent is None else self.latent.temperature(y, self.capacity)
 
     def is_melting(self, y: Array) -> Array | None:

@@ -140,9 +140,17 @@ class Fusing(Rule):
 
 
 def melted_fraction(net: Topology, state: State) -> Array:
-    """Share of the particles that no living spring holds (leading axes of saved states are not accepted: use `jax.vmap`).
+    """Share of the particles that no living spring holds.
 
-    Raises ValueError where the state's springs are those of another net.
+    Args:
+        net: the topology whose springs fuse.
+        state: one state; leading axes of saved states are not accepted: use `jax.vmap`.
+
+    Returns:
+        A number from 0 to 1, 0-d.
+
+    Raises:
+        ValueError: the state's springs are those of another net.
     """
     return jnp.mean(Molten(net).is_fluid(state).astype(state.dtype))
 

@@ -282,6 +282,9 @@ def total_heat(heat: Heat, state: State) -> Array:
         heat: the rule.
         state: with a temperature, and an enthalpy where heat has latent heat (a state that went through `system.begin` or `rollout`).
 
+    Returns:
+        The heat [J], 0-d.
+
     >>> import jaxspring as js
     >>> net = js.lattice(3)
     >>> state = js.State.from_points(net, net.grid(), temperature=300.0)

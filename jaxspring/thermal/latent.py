@@ -60,7 +60,7 @@ class LatentHeat(eqx.Module):
         return temperature - self.melting + enthalpy / capacity
 
     def temperature(self, y: Array, capacity: Array) -> Array:
-        """Temperature [K]."""
+        """Temperature of the variable y [K]."""
         # In this order nodes that melt are at the melting point exactly.
         return self.melting + self.above(y, capacity)
 

@@ -34,11 +34,11 @@ from ..topology.edge_field import EdgeField, SpringNumbers
 class ThermalStiffness(StiffnessRule):
     """Full stiffness below the softening temperature, none from the melting point on, linear between.
 
-    Attributes:
-        full: k0 [N/m]: a number, (E,) in the user's order, or an `EdgeField`.
-        softening: theta_s [K].
-        melting: theta_m [K].
-        sharpness: b of the smooth version; None is the exact ramp.
+    Args:
+        stiffness: k0 [N/m]: a number, (E,) in the user's order, or an `EdgeField`; kept as `full`.
+        softening: theta_s [K], a number.
+        melting: theta_m [K], a number.
+        sharpness: b of the smooth version, a number; None is the exact ramp.
 
     Raises:
         ValueError: a negative stiffness, a melting point that is not above the softening temperature, a sharpness that is not positive.
@@ -75,7 +75,7 @@ class ThermalStiffness(StiffnessRule):
 
     @property
     def follows_position(self) -> bool:
-        """No: at a given temperature the springs have a potential."""
+        """Whether the stiffness depends on where the nodes are: at a given temperature the springs have a potential."""
         return False
 
     def stiffness(self, net: Topology, state: State) -> EdgeField:

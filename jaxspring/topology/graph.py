@@ -37,6 +37,9 @@ class Graph(Topology):
         reduction: how pulls are summed on nodes.
         box: (D,) period of each coordinate [m], or None.
         triangles: (T, 3) triangles in the user's numbering, or None.
+        count: N (static).
+        nodes: the user's order of the nodes and the graph's own (static).
+        springs: the user's order of the springs and the graph's own (static).
         digest: of the springs in the user's numbering and order (static).
         name: tells it from other nets of the same springs, or None: see `named`.
     """
@@ -63,7 +66,7 @@ class Graph(Topology):
             n_nodes: number of nodes N; a node without a spring is allowed.
             box: (D,) period of each coordinate [m]; zero where a coordinate is not periodic.
             triangles: (T, 3) triangles, kept for plots and surfaces.
-            reduction: `Gather` (no scatter in any program) or `Scatter`, which compiles sooner; see docs/benchmarks.md for their speed.
+            reduction: `Gather` (no scatter in any program) or `Scatter`, which compiles sooner; see `docs/benchmarks.md` for their speed.
                 None takes `Gather`, but `Scatter` on a CPU for more nodes than `FASTER_BY_SCATTER`.
 
         Raises:
@@ -100,17 +103,17 @@ class Graph(Topology):
 
     @property
     def node_shape(self) -> tuple[int, ...]:
-        """(N,)"""
+        """Shape of a node array: (N,)."""
         return (self.count,)
 
     @property
     def family_shapes(self) -> tuple[tuple[int, ...], ...]:
-        """((E,),)"""
+        """Shape of an edge field of the only family of springs: ((E,),)."""
         return (self.tails.shape,)
 
     @property
     def family_sizes(self) -> tuple[int, ...]:
-        """(E,)"""
+        """Number of springs of the only family: (E,)."""
         return self.tails.shape
 
     def inside(self, field: EdgeField, fill: float) -> EdgeField:

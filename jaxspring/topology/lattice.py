@@ -263,6 +263,9 @@ def lattice(
         periodic: whether an axis wraps round, for all axes or one each.
         box: (D,) period of each coordinate [m] where an axis wraps; zero where a coordinate does not. Required if any axis wraps.
 
+    Returns:
+        The net, without points: `net.grid(spacing)` has those of the rest shape, (N, D) [m].
+
     Raises:
         ValueError: an empty lattice, more than three axes, a family that this dimension lacks, a wrap without a box, a period that is
             negative, not finite, or zero along an axis that wraps.

@@ -47,7 +47,11 @@ class Reduction(eqx.Module):
 
 
 class Scatter(Reduction):
-    """Each spring adds to its two nodes by `.at[].add`."""
+    """Each spring adds to its two nodes by `.at[].add`.
+
+    Attributes:
+        count: number of nodes (static).
+    """
 
     count: int = eqx.field(static=True)
 

@@ -72,7 +72,7 @@ def silent_methods(cls: type) -> list[str]:
 
 
 def written(thing: object, name: str) -> bool:
-    """Whether there is a docstring that somebody wrote: a dataclass without one is given `Name(field: type)`."""
+    """Whether there is a docstring that somebody wrote: a dataclass without one is given its name and fields in brackets."""
     text = thing.__doc__ or ""
     return bool(text.strip()) and not text.startswith(f"{name}(")
 

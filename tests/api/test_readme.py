@@ -1,8 +1,5 @@
 """The README's commands and example, and the Python on every page of docs/, are what works today."""
 
-import pathlib
-import re
-
 import pytest
 
 from tests import markdown, source
@@ -37,11 +34,3 @@ def test_python_on_a_page_runs(path, user_mode, tmp_path, monkeypatch):
     """The Python blocks of a page, run in order in one namespace, work and hold what they assert."""
     monkeypatch.chdir(tmp_path)
     markdown.run(path, markdown.blocks(path, "python"))
-
-
-@pytest.mark.parametrize("path", [*source.ROOT.glob("*.md"), *(source.ROOT / "docs").glob("*.md")], ids=lambda path: path.stem)
-def test_links_lead_somewhere(path):
-    """Every relative link or picture on a page names a file that exists."""
-    targets = re.findall(r"\]\(([^)#\s]+)[^)]*\)", path.read_text(encoding="utf-8"))
-    local = [target for target in targets if "://" not in target and not target.startswith("mailto:")]
-    assert [target for target in local if not pathlib.Path(path.parent, target).exists()] == []

@@ -381,7 +381,7 @@ def test_what_an_adaptive_solver_cannot_honour_is_named():
         """Acts after steps."""
 
         def force(self, state):
-            """Nothing."""
+            """No pull on any node."""
             return js.Vector.zeros_like(state.position)
 
         def update(self, step, state):

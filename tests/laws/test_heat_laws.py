@@ -118,8 +118,8 @@ def test_every_chain_that_melts_is_solved(rng):
 
 @pytest.mark.slow
 def test_what_a_melting_step_minimises_falls(rng):
-    """F of `phase.py`, in NumPy: no higher after a relaxation; after a search the lowest of Newton's step, its halves, and the one that
-    stops at the melting point.
+    """F of `thermal/phase.py`, in NumPy: no higher after a relaxation; after a search the lowest of Newton's step, its halves, and the one
+    that stops at the melting point.
     """
     k, n_crossed = np.zeros((12, 12)), 0
 

@@ -231,7 +231,7 @@ def test_as_users_run_it(user_mode, rng):
 
 
 def test_points_of_two_shapes_are_refused(rng):
-    """X and y are one array each, of one shape."""
+    """x and y are one array each, of one shape."""
     with pytest.raises(ValueError, match=r"x has shape \(3,\) and y has shape \(2,\)"):
         Image(rng.random((4, 4))).sample(np.ones(3), np.ones(2))
 

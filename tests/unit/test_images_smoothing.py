@@ -37,7 +37,7 @@ def test_keeps_the_mean(rng):
 
 
 def test_zero_sigma_is_the_identity(rng, dtype):
-    """Sigma = 0 returns the pixels bitwise, by the concrete and by the traced way, and its derivative is exactly 0."""
+    """sigma = 0 returns the pixels bitwise, by the concrete and by the traced way, and its derivative is exactly 0."""
     image = Image(rng.random((8, 9)).astype(dtype))
     np.testing.assert_array_equal(smooth(image, 0.0).values, image.values)
     for sigma in (0.0, 1e-30, 1e-6, 0.05):

@@ -234,7 +234,7 @@ class Endless(Cutoff):
 
     @property
     def reach(self):
-        """None."""
+        """No distance, as of a law without an end."""
         return None
 
     def weight(self, law, squared):

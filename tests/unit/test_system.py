@@ -24,7 +24,7 @@ def flat(net, vector):
 
 
 def test_acceleration_is_force_over_mass(scene):
-    """F = m a for each node in the user's order, springs and drag together."""
+    """f = m a for each node in the user's order, springs and drag together."""
     net, state, m = scene
     system = js.System(net, m, (js.Springs(net, 3.0, 0.5), js.Drag(0.2)))
     force = reference.spring_forces(state.points, net.edges, 3.0, 0.5) - 0.2 * np.asarray(state.velocities)

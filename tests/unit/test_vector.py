@@ -42,7 +42,7 @@ def test_arithmetic_from_the_left(op, pair):
 
 
 def test_dot_norm_and_negative(pair):
-    """dot, norm and the negative are NumPy's along the coordinate axis."""
+    """Dot product, norm and the negative are NumPy's along the coordinate axis."""
     a, b = pair
     np.testing.assert_allclose(a.dot(b), (stacked(a) * stacked(b)).sum(axis=0), rtol=1e-15)
     np.testing.assert_allclose(a.norm(), np.linalg.norm(stacked(a), axis=0), rtol=1e-15)
@@ -69,7 +69,7 @@ def test_float32_stays_float32():
 
 
 def test_shape_and_coordinates(pair):
-    """dim, shape, x y z, iteration and indexing agree with the arrays put in."""
+    """Dimension, shape, x y z, iteration and indexing agree with the arrays put in."""
     a, _ = pair
     assert (a.dim, a.shape, len(a)) == (3, (2, 5), 3)
     assert a.x is a[0]

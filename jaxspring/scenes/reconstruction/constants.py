@@ -5,8 +5,9 @@ data springs of constant k_data pull each node to the image. The loss joins two 
 
     value = w log rms_pixel + (1 - w) log rms_data
 
-`data`: the heights at the end of the rollout. `pixel`: the heights at which one spring of constant k_pixel per pixel balances the springs
-along z. Those minimise an energy, not this loss, so their derivative is taken implicitly and never stopped.
+The data error is that of the heights at the end of the rollout. The pixel error is that of the heights at which one spring of constant
+k_pixel per pixel balances the springs along z. Those minimise an energy, not this loss, so their derivative is taken implicitly and never
+stopped.
 """
 
 from __future__ import annotations
@@ -181,6 +182,9 @@ def fit_constants(
         checkpoint: where and how often to save, as in `fit`.
         resume: go on from the checkpoint.
         progress: shows a bar.
+
+    Returns:
+        Meshes of the law before and after, errors under both rules, stiffnesses (E,) [N/m], and the fit.
 
     Raises:
         ValueError: a name that is not in `NAMES`, or none.

@@ -112,6 +112,9 @@ def fit_springs(
         resume: go on from the checkpoint.
         progress: shows a bar.
 
+    Returns:
+        Meshes before and after, errors under both rules, stiffnesses (E,) [N/m], and the fit.
+
     Raises:
         ValueError: an image or a mesh too small for a surface.
     """

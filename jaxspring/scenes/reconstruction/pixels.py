@@ -154,7 +154,7 @@ class PixelSprings(Force):
         self.stiffness = constant("stiffness", stiffness, "A negative data spring pushes away from the image.", may_be_zero=True)
 
     def force(self, state: State) -> Vector:
-        """K (b - N z) along the last coordinate [N], zero along the others."""
+        """k (b - N z) along the last coordinate [N], zero along the others."""
         *plane, z = state.position
         pull = self.stiffness.astype(z.dtype) * (self.equations.right_side - self.equations.apply(z - MIDDLE))
         return Vector((*(jnp.zeros_like(a) for a in plane), pull))

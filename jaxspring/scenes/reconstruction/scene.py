@@ -49,6 +49,10 @@ class Relaxation(eqx.Module):
 class Reconstruction(eqx.Module):
     """An image and the lattice that is to recover it.
 
+    Args:
+        image: the data, in any unit.
+        nodes: (ny, nx), nodes of the lattice along y and along x.
+
     Attributes:
         image: the data, scaled to [0, 1]; positions are in the unit of its spacing (pixels unless said).
         low, extent: value 0 and range of the scaled image in the image's own unit.

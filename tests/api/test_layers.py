@@ -11,6 +11,8 @@ LAYERS = {
     "_version": 0,
     "_arrays": 0,
     "_checks": 0,
+    "_lazy": 0,
+    "_names": 0,  # a table of strings, though of the names of all layers
     "numerics": 0,
     "facts": 0,
     "printing": 0,
@@ -25,6 +27,7 @@ LAYERS = {
     "files": 3,
     "forces": 3,
     "thermal": 3,
+    "fluid": 3,  # public names of forces
     "masses": 4,
     "system": 4,
     "edit": 4,
@@ -43,6 +46,7 @@ LAYERS = {
     "study": 7,
     "plots": 7,
     "scenes": 8,
+    "reconstruction": 8,  # public names of a scene
     "cli": 8,
     "__main__": 9,
     "__init__": 9,  # the public names

@@ -11,12 +11,12 @@ import jaxspring as js
 from tests.particles import blob, make
 
 pytestmark = pytest.mark.slow
-CHOICES = pytest.mark.parametrize("pairs", [js.AllPairs(tile=5), js.NeighbourList(64, 0.3)], ids=["tiles", "list"])
+CHOICES = pytest.mark.parametrize("pairs", [js.fluid.AllPairs(tile=5), js.fluid.NeighbourList(64, 0.3)], ids=["tiles", "list"])
 
 
 def fluid_of(pairs, rng, n=20):
     """A short-ranged fluid with its list begun, a direction to move in and one to weigh the forces with."""
-    system, state = make(blob(rng, n), rng.uniform(0.5, 2, n), cutoff=js.ShiftedForce(2.5), pairs=pairs)
+    system, state = make(blob(rng, n), rng.uniform(0.5, 2, n), cutoff=js.fluid.ShiftedForce(2.5), pairs=pairs)
     system = system.prepare(state.dtype)
     along, weights = (js.Vector(tuple(jnp.asarray(rng.normal(size=n)) for _ in range(3))) for _ in range(2))
     return system, jax.jit(lambda s: system.begin(s))(state), along, weights
@@ -54,8 +54,8 @@ def test_gradient_of_a_rollout(pairs, rng):
     first = state.moved(state.position, 2 * along)
 
     def loss(h):
-        changed = js.SlideLaw(1.0 + 0.3 * h, 1.0, 0.1)
-        fluid = js.Fluid(changed, cutoff=js.ShiftedForce(2.5), pairs=pairs)
+        changed = js.fluid.SlideLaw(1.0 + 0.3 * h, 1.0, 0.1)
+        fluid = js.Fluid(changed, cutoff=js.fluid.ShiftedForce(2.5), pairs=pairs)
         moved = first.moved(first.position + h * along, first.velocity)
         end = js.rollout(js.System(system.net, system.mass, fluid), moved, js.SymplecticEuler(), 5e-3, 12).state
         return dot(end.position, end.position)
@@ -87,15 +87,15 @@ def test_derivatives_by_everything(pairs, rng):
     """A dragged, half molten fluid of uneven masses, by positions, speeds, masses and constants: the dot test, and central differences."""
     points, n = blob(rng, 20), 20
     net = js.Graph.from_edges([[i, i + 1] for i in range(0, n // 2)], n)
-    alive = js.EdgeField((jnp.ones(net.n_springs, bool),))
+    alive = js.topology.EdgeField((jnp.ones(net.n_springs, bool),))
     start = js.State.from_points(net, points, rng.normal(size=(n, 3)))
     start = dataclasses.replace(start, alive=alive)
     weights = js.Vector(tuple(jnp.asarray(rng.normal(size=n)) for _ in range(3)))
 
     def force(at):
         position, velocity, mass, alpha, zeta, damping, radius = at
-        drag, law = js.PairDrag(damping, radius), js.SlideLaw(alpha, 1.0, zeta)
-        fluid = js.Fluid(law, js.ShiftedForce(2.5), pairs, drag, molten=js.Molten(net)).with_mass(mass)
+        drag, law = js.fluid.PairDrag(damping, radius), js.fluid.SlideLaw(alpha, 1.0, zeta)
+        fluid = js.Fluid(law, js.fluid.ShiftedForce(2.5), pairs, drag, molten=js.fluid.Molten(net)).with_mass(mass)
         return fluid.force(fluid.begin(start.moved(position, velocity)))
 
     at = (start.position, start.velocity, jnp.asarray(rng.uniform(0.5, 2, n)), *(jnp.asarray(a) for a in (1.0, 0.1, 0.7, 2.2)))

@@ -53,7 +53,7 @@ def pull_of_one(r, k, l):
 
 
 def thermal(net, k, l):
-    return js.Springs(net, js.ThermalStiffness(k, 300.0, 400.0), l, expansion=js.ThermalExpansion(1e-3, 300.0))
+    return js.Springs(net, js.thermal.ThermalStiffness(k, 300.0, 400.0), l, expansion=js.thermal.ThermalExpansion(1e-3, 300.0))
 
 
 EFFECTS = {
@@ -82,7 +82,7 @@ def answers(net, make, alive, k, l, x):
         system = js.System(net, 1.0, make(net, k, l))
         f = system.force(state)
         v = js.Vector(tuple(net.node_field(jnp.asarray(SPEEDS[:, i])) for i in range(2)))
-        blocks = system.stiffness_blocks(state, js.ExactTangent()) + system.damping_blocks(state)
+        blocks = system.stiffness_blocks(state, js.steppers.ExactTangent()) + system.damping_blocks(state)
         kv = system.matrix(blocks, state)(v)
         flat = jnp.stack([net.flatten_nodes(a) for a in (*f, *kv)])
         energy = system.energy(state).potential[0]
@@ -200,7 +200,7 @@ def test_k8_two_nets_cannot_both_fuse():
 
 def test_k8_a_field_made_by_hand_is_of_the_systems_net():
     """An `alive` that does not say whose springs it tells about is that of the system's net, and of no other net with as many springs."""
-    bare = js.EdgeField((jnp.array([True, False, True]),))
+    bare = js.topology.EdgeField((jnp.array([True, False, True]),))
     own, others = js.Springs(ONE, 10.0, 1.0), js.Springs(OTHER, 20.0, 1.0)
     state = js.State.from_points(ONE, LINE)
     force = js.System(ONE, 1.0, (own, others)).force(dataclasses.replace(state, alive=bare))
@@ -218,8 +218,10 @@ REFUSALS = {
     "cut by what is alive": lambda: js.Heat(ONE, 1.0, 1.0, cut_by=ONE).power(
         dataclasses.replace(js.State.from_points(ONE, LINE, temperature=HOT), alive=OTHER.split(jnp.ones(3, bool)))
     ),
-    "melted": lambda: js.melted_fraction(ONE, dataclasses.replace(js.State.from_points(ONE, LINE), alive=OTHER.split(jnp.ones(3, bool)))),
-    "boundary": lambda: js.Heat(ONE, 1.0, 1.0, boundaries=js.FixedTemperature(TURNED, np.arange(4) == 0, 300.0)),
+    "melted": lambda: js.thermal.melted_fraction(
+        ONE, dataclasses.replace(js.State.from_points(ONE, LINE), alive=OTHER.split(jnp.ones(3, bool)))
+    ),
+    "boundary": lambda: js.Heat(ONE, 1.0, 1.0, boundaries=js.thermal.FixedTemperature(TURNED, np.arange(4) == 0, 300.0)),
     "skyline": lambda: js.Skyline(ONE).init(matrix_on(OTHER)),
 }
 # Joined otherwise, so that its nodes have another order inside.
@@ -229,7 +231,7 @@ TURNED = js.Graph.from_edges([(0, 3), (3, 1), (1, 2)], 4)
 def matrix_on(net):
     system = js.System(net, 1.0, js.Springs(net, 10.0, 1.0))
     state = js.State.from_points(net, LINE)
-    return system.matrix(system.stiffness_blocks(state, js.Tangent()), state)
+    return system.matrix(system.stiffness_blocks(state, js.steppers.Tangent()), state)
 
 
 @pytest.mark.parametrize("act", REFUSALS.values(), ids=REFUSALS.keys())
@@ -355,7 +357,7 @@ def test_k9_right_or_reported_from_1e_minus_30_to_1e30(law, pull, energy):
     def found(k, l, x, y):
         d = js.Vector((x, y))
         value = spring_energy(law, d, k, l) if energy is not None else jnp.zeros_like(k)
-        weight, slope, _ = spring_block(law, js.ExactTangent(), d, k, l)
+        weight, slope, _ = spring_block(law, js.steppers.ExactTangent(), d, k, l)
         return spring_pull(law, d, k, l)[0] / 0.6, value, weight, weight + slope, has_no_direction(d), is_beyond_range(d)
 
     got_pull, got_energy, weight, along, near, far = (np.asarray(a) for a in found(*single))
@@ -464,49 +466,147 @@ def instances():
     heat, fusing = js.Heat(TWO, 1.0, 1.0), js.Fusing(TWO, 350.0)
     system = js.System(TWO, 1.0, springs, rules=(heat, fusing))
     number, whole, status = jnp.array(1.5), jnp.array(3), js.Status.ok()
-    info = js.SolveInfo(number, whole, status)
-    matrix = system.matrix(system.stiffness_blocks(state, js.Tangent()) + js.Blocks((js.Vector((jnp.ones(2),)),)), state)
+    info = js.linalg.SolveInfo(number, whole, status)
+    matrix = system.matrix(system.stiffness_blocks(state, js.steppers.Tangent()) + js.linalg.Blocks((js.Vector((jnp.ones(2),)),)), state)
     direct = js.Skyline(TWO)
     resume = js.Resume(number, whole, whole, number, number, None, whole, whole, Origin.of(system, state, js.SymplecticEuler()))
     ode = js.OdeInfo(whole, whole, whole, None, None)
     fit = js.Fit(
-        {"k": number}, {"k": number}, 1.0, 3, js.History(*np.ones((3, 2))), None, None, None, status, js.StopReason.ITERATIONS, None, ""
+        {"k": number},
+        {"k": number},
+        1.0,
+        3,
+        js.inverse.History(*np.ones((3, 2))),
+        None,
+        None,
+        None,
+        status,
+        js.inverse.StopReason.ITERATIONS,
+        None,
+        "",
     )
-    pixels = js.PixelSprings(None, 1.0)
+    pixels = js.reconstruction.PixelSprings(None, 1.0)
     classes = [
         js.Account(number, number, number, number, number, number),
-        *(js.Adam(), js.LBFGS(), js.LeastSquares(), js.Optax(optax.identity()), js.Stop()),
-        *(js.AllPairs(), js.NeighbourList(8, 0.1), js.PairDrag(1.0, 1.0), js.NoCutoff(), js.PlainCutoff(2.0), js.ShiftedForce(2.0)),
-        *(js.Switched(1.0, 2.0), js.SlideLaw(1.0, 1.0), js.UnitVectorLaw(1.0, 1.0), js.LennardJones(1.0, 1.0)),
-        js.Fluid(js.LennardJones(1.0, 1.0)),
+        *(js.Adam(), js.LBFGS(), js.LeastSquares(), js.inverse.Optax(optax.identity()), js.Stop()),
+        *(
+            js.fluid.AllPairs(),
+            js.fluid.NeighbourList(8, 0.1),
+            js.fluid.PairDrag(1.0, 1.0),
+            js.fluid.NoCutoff(),
+            js.fluid.PlainCutoff(2.0),
+            js.fluid.ShiftedForce(2.0),
+        ),
+        *(js.fluid.Switched(1.0, 2.0), js.fluid.SlideLaw(1.0, 1.0), js.fluid.UnitVectorLaw(1.0, 1.0), js.fluid.LennardJones(1.0, 1.0)),
+        js.Fluid(js.fluid.LennardJones(1.0, 1.0)),
         *(js.BDF2(), js.BackwardEuler(direct), js.ImplicitMidpoint(newton=True), js.SemiImplicit(), js.Newton(), js.Still()),
         *(js.ForwardEuler(), js.RungeKutta4(), js.SymplecticEuler(), js.VelocityVerlet()),
-        *(js.BackwardEulerHeat(), js.CrankNicolsonHeat(), js.ExplicitHeat(), js.SplitHeat(), js.SymmetricSplitHeat(), js.HeatIteration()),
-        *(js.Bilinear(), js.CubicSpline(), js.Curvature(), js.GradientMagnitude(), js.Intensity(), js.Channel(0), js.Luminance()),
-        js.Combined([js.Intensity(), js.Curvature()], [1.0, 2.0]),
-        *(js.BlockJacobi(), js.Jacobi(), js.Unpreconditioned(), js.Multigrid(TWO), js.CG(), js.JaxCG(), js.ExactSolver()),
-        *(js.Lineax(lineax.CG(1e-6, 1e-6)), direct, direct.factor(matrix), direct.profile(), js.Natural(), js.ReverseCuthillMcKee(), info),
-        *(matrix, matrix.blocks, matrix.blocks.springs[0], js.NodeDyads(number, js.Vector((number,)))),
-        *(js.Bounded(0.0, 1.0), js.Identity(), js.Positive(), js.SoftPositive(), js.Selection((number, whole), first)),
+        *(
+            js.thermal.BackwardEulerHeat(),
+            js.thermal.CrankNicolsonHeat(),
+            js.thermal.ExplicitHeat(),
+            js.thermal.SplitHeat(),
+            js.thermal.SymmetricSplitHeat(),
+            js.thermal.HeatIteration(),
+        ),
+        *(
+            js.images.Bilinear(),
+            js.images.CubicSpline(),
+            js.images.Curvature(),
+            js.images.GradientMagnitude(),
+            js.images.Intensity(),
+            js.images.Channel(0),
+            js.images.Luminance(),
+        ),
+        js.images.Combined([js.images.Intensity(), js.images.Curvature()], [1.0, 2.0]),
+        *(
+            js.linalg.BlockJacobi(),
+            js.linalg.Jacobi(),
+            js.linalg.Unpreconditioned(),
+            js.linalg.Multigrid(TWO),
+            js.CG(),
+            js.JaxCG(),
+            js.linalg.ExactSolver(),
+        ),
+        *(
+            js.linalg.Lineax(lineax.CG(1e-6, 1e-6)),
+            direct,
+            direct.factor(matrix),
+            direct.profile(),
+            js.linalg.Natural(),
+            js.linalg.ReverseCuthillMcKee(),
+            info,
+        ),
+        *(matrix, matrix.blocks, matrix.blocks.springs[0], js.linalg.NodeDyads(number, js.Vector((number,)))),
+        *(
+            js.Bounded(0.0, 1.0),
+            js.inverse.Identity(),
+            js.Positive(),
+            js.inverse.SoftPositive(),
+            js.inverse.Selection((number, whole), first),
+        ),
         *(js.Checkpoint("a.npz"), js.Checkpointed(), js.StoreAll(), js.StoreStates(), js.Progress(callback=tell)),
-        *(js.ConstantsSettings(), js.SpringSettings(), js.Relaxation(), js.Reconstruction(image, (3, 3)), pixels),
-        js.Reconstructed(*[None] * len(dataclasses.fields(js.Reconstructed))),
-        *(js.Convection(TWO, nodes, 1.0, ambient, 1.0), js.FixedTemperature(TWO, nodes, 300.0), js.HeatFlux(TWO, nodes, 1.0, 1.0)),
-        *(js.Radiation(TWO, nodes, 1.0, 300.0, 1.0), js.HotPlane((0.0,), (1.0,), 300.0, 1.0, 1.0, 0.1), js.ThermalBoundary()),
-        *(js.EqualCells(), js.HalfCells(), js.LatentHeat(350.0, 1.0), heat, fusing, js.Refreezing(1.0, 2.0), js.Ledger(heat)),
-        *(js.ThermalExpansion(1e-3, 300.0), js.ThermalStiffness(1.0, 300.0, 350.0), js.Molten(TWO)),
+        *(
+            js.reconstruction.ConstantsSettings(),
+            js.reconstruction.SpringSettings(),
+            js.reconstruction.Relaxation(),
+            js.reconstruction.Reconstruction(image, (3, 3)),
+            pixels,
+        ),
+        js.reconstruction.Reconstructed(*[None] * len(dataclasses.fields(js.reconstruction.Reconstructed))),
+        *(
+            js.thermal.Convection(TWO, nodes, 1.0, ambient, 1.0),
+            js.thermal.FixedTemperature(TWO, nodes, 300.0),
+            js.thermal.HeatFlux(TWO, nodes, 1.0, 1.0),
+        ),
+        *(
+            js.thermal.Radiation(TWO, nodes, 1.0, 300.0, 1.0),
+            js.thermal.HotPlane((0.0,), (1.0,), 300.0, 1.0, 1.0, 0.1),
+            js.thermal.ThermalBoundary(),
+        ),
+        *(
+            js.thermal.EqualCells(),
+            js.thermal.HalfCells(),
+            js.thermal.LatentHeat(350.0, 1.0),
+            heat,
+            fusing,
+            js.thermal.Refreezing(1.0, 2.0),
+            js.Ledger(heat),
+        ),
+        *(js.thermal.ThermalExpansion(1e-3, 300.0), js.thermal.ThermalStiffness(1.0, 300.0, 350.0), js.fluid.Molten(TWO)),
         *(js.Dashpots(TWO, 1.0), js.Drag(0.1), js.Rayleigh(0.1, 0.2), js.Gravity((0.0, -9.81)), js.Load(push), js.Floor((0.0,), (1.0,))),
         *(js.DataSprings(image, 1.0), js.ImageAttraction(image, 1.0), js.ImageStiffness(image, 1.0, 2.0, 1.0)),
         *(js.EnergyLaw(energy_of_one), js.Hooke(), js.PowerLaw(), js.PullLaw(pull_of_one), js.TensionOnly()),
-        *(js.ExactTangent(), js.Secant(), js.Tangent(), springs, system, state, js.Motion(jnp.array(nodes), place)),
-        *(image, image.surface(js.Bilinear()), js.Modes(number, number), js.Vector((number,)), TWO.edge_field(jnp.ones(1)), TWO, WHOLE),
-        *(WHOLE.reduction, js.Graph.from_edges([(0, 1)], 2, reduction=js.Scatter).reduction, js.lattice((3, 3)).named("second")),
-        *(js.Energy(number, (None,)), js.Finding(js.Flag.OUTSIDE, whole, whole), js.Flag.OK, status, js.StopReason.ITERATIONS),
+        *(
+            js.steppers.ExactTangent(),
+            js.steppers.Secant(),
+            js.steppers.Tangent(),
+            springs,
+            system,
+            state,
+            js.Motion(jnp.array(nodes), place),
+        ),
+        *(
+            image,
+            image.surface(js.images.Bilinear()),
+            js.Modes(number, number),
+            js.Vector((number,)),
+            TWO.edge_field(jnp.ones(1)),
+            TWO,
+            WHOLE,
+        ),
+        *(WHOLE.reduction, js.Graph.from_edges([(0, 1)], 2, reduction=js.topology.Scatter).reduction, js.lattice((3, 3)).named("second")),
+        *(js.Energy(number, (None,)), js.Finding(js.Flag.OUTSIDE, whole, whole), js.Flag.OK, status, js.inverse.StopReason.ITERATIONS),
         *(js.Equilibrium(state, info, whole, status, ("Springs",)), js.Solves(whole, number, status, info)),
         *(ode, js.OdeResult(state, None, number, status, ode, None, ("Springs",)), resume),
         js.Result(state, None, status, Info(None, whole), resume, ("Springs",)),
-        *(fit, fit.history, js.Iteration(1, 1.0, 1.0, 1.0, True, None, None, None, {"k": number}), js.GradientCheck((), 1.0, status)),
-        js.Undetermined(1, {"k": whole}, None, ("k",)),
+        *(
+            fit,
+            fit.history,
+            js.inverse.Iteration(1, 1.0, 1.0, 1.0, True, None, None, None, {"k": number}),
+            js.inverse.GradientCheck((), 1.0, status),
+        ),
+        js.inverse.Undetermined(1, {"k": whole}, None, ("k",)),
     ]
     return {type(a).__name__: a for a in classes}
 
@@ -558,7 +658,7 @@ def test_k6_a_direct_solver_serves_after_pickling(net):
     points = np.random.default_rng(0).normal(size=(net.n_nodes, 2))
     system = js.System(net, 1.0, js.Springs(net, 10.0, 1.0))
     state = js.State.from_points(net, points)
-    blocks = js.Blocks((state.position.map(jnp.ones_like),)) + system.stiffness_blocks(state, js.Tangent())
+    blocks = js.linalg.Blocks((state.position.map(jnp.ones_like),)) + system.stiffness_blocks(state, js.steppers.Tangent())
     matrix, solver = system.matrix(blocks, state), js.Skyline(net)
     right = solver.factor(matrix).solve(state.position)
     named = eqx.tree_at(lambda m: m.blocks.springs[0].net, matrix, net.named("a"))

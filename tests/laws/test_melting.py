@@ -35,7 +35,7 @@ def softened(dtype):
     @jax.jit
     def both(temperature, softening, melting, sharpness):
         state = js.State.from_points(NET, jnp.zeros((N, 2), dtype), temperature=temperature)
-        rules = (js.ThermalStiffness(FULL, softening, melting), js.ThermalStiffness(FULL, softening, melting, sharpness))
+        rules = (js.thermal.ThermalStiffness(FULL, softening, melting), js.thermal.ThermalStiffness(FULL, softening, melting, sharpness))
         return tuple(NET.flatten(rule.stiffness(NET, state)) for rule in rules)
 
     return lambda *numbers: tuple(np.asarray(k, float) for k in both(*(jnp.asarray(n, dtype) for n in numbers)))
@@ -90,7 +90,7 @@ def history(temperatures, points, stiffness, hysteresis, reach):
 
         return js.rollout(system, start, js.Still(), 0.5, STEPS, save_every=1, observe=look).saved
 
-    return run(None), run(js.Refreezing(hysteresis, reach))
+    return run(None), run(js.thermal.Refreezing(hysteresis, reach))
 
 
 @settings(max_examples=60)
@@ -132,7 +132,7 @@ def test_springs_fuse_and_come_back(seed, swing, hysteresis, reach):
 @jax.jit
 def phases(y, melting, latent, capacity):
     """Temperatures, latent heats, and y made of them again."""
-    law = js.LatentHeat(melting, latent)
+    law = js.thermal.LatentHeat(melting, latent)
     theta, h = law.temperature(y, capacity), law.enthalpy(y, capacity)
     return theta, h, law.joined(theta, h, capacity)
 
@@ -160,8 +160,8 @@ def test_temperature_and_enthalpy_are_one_variable(seed, melting, log_latent, lo
 
 def scene(latent, conductance):
     """An insulated sheet that softens, melts and tears while it swings, with a book of its energy."""
-    heat = js.Heat(ALONG, 1.0, conductance, latent=js.LatentHeat(MELTING, latent), cut_by=NET)
-    springs = js.Springs(NET, js.ThermalStiffness(FULL, 320.0, 370.0), NET.lengths(NET.grid()))
+    heat = js.Heat(ALONG, 1.0, conductance, latent=js.thermal.LatentHeat(MELTING, latent), cut_by=NET)
+    springs = js.Springs(NET, js.thermal.ThermalStiffness(FULL, 320.0, 370.0), NET.lengths(NET.grid()))
     return js.System(NET, 1.0, (springs, js.Drag(0.3)), rules=js.Ledger((heat, js.Fusing(NET, MELTING))))
 
 
@@ -189,7 +189,7 @@ def test_an_insulated_body_melts(seed, hot, log_latent, log_conductance):
     system = scene(latent, conductance)
     book = js.energy_ledger(system, end)
     heat = system.rules[0].rules[0]
-    assert float(js.total_heat(heat, end)) == pytest.approx(float(js.total_heat(heat, start)), rel=1e-14)
+    assert float(js.thermal.total_heat(heat, end)) == pytest.approx(float(js.thermal.total_heat(heat, start)), rel=1e-14)
     assert abs(book["rules"]["Heat"]["heat"]) <= 1e-11
     fusing = book["rules"]["Fusing"]
     assert fusing["Springs"] <= 0

@@ -20,7 +20,7 @@ def warm(net, temperature, scale=1.0, **more):
 
 def stiffness_at(theta, sharpness=None):
     net = js.lattice(2)
-    rule = js.ThermalStiffness(80.0, 300.0, 400.0, sharpness)
+    rule = js.thermal.ThermalStiffness(80.0, 300.0, 400.0, sharpness)
     return float(net.flatten(rule.stiffness(net, warm(net, theta)))[0])
 
 
@@ -43,13 +43,13 @@ def test_the_smooth_ramp_tends_to_the_hard_one():
 def test_mean_of_the_ends():
     """A spring between 300 K and 400 K is as one at 350 K."""
     net = js.lattice(2)
-    rule = js.ThermalStiffness(80.0, 300.0, 400.0)
+    rule = js.thermal.ThermalStiffness(80.0, 300.0, 400.0)
     assert float(net.flatten(rule.stiffness(net, warm(net, [300.0, 400.0])))[0]) == pytest.approx(40)
 
 
 def test_expansion():
     """A free chain heated by 100 K is at rest when longer by a * 100 K: no force there, and the closed form before it."""
-    springs = js.Springs(CHAIN, 7.0, 1.0, expansion=js.ThermalExpansion(2e-3, 300.0))
+    springs = js.Springs(CHAIN, 7.0, 1.0, expansion=js.thermal.ThermalExpansion(2e-3, 300.0))
     at_rest = js.System(CHAIN, 1.0, springs).force(warm(CHAIN, 400.0, 1.2))
     np.testing.assert_allclose(at_rest.x, 0, atol=1e-14)
     squeezed = js.System(CHAIN, 1.0, springs).force(warm(CHAIN, 400.0))
@@ -58,7 +58,7 @@ def test_expansion():
 
 def test_expansion_stops_at_nothing():
     """Cooled below -1 / a a rest length is zero, never less: the springs pull their ends together, and no further."""
-    springs = js.Springs(CHAIN, 7.0, 1.0, expansion=js.ThermalExpansion(2e-2, 300.0))
+    springs = js.Springs(CHAIN, 7.0, 1.0, expansion=js.thermal.ThermalExpansion(2e-2, 300.0))
     cold = warm(CHAIN, 200.0)
     np.testing.assert_array_equal(CHAIN.flatten(springs.natural_length(cold)), 0)
     np.testing.assert_allclose(springs.force(cold).x, [7, 0, 0, 0, -7], atol=1e-14)
@@ -68,7 +68,7 @@ def test_springs_with_thermal_stiffness_have_an_energy():
     """Minus the gradient of the energy by position is the force, at any temperature."""
     import jax
 
-    springs = js.Springs(SHEET, js.ThermalStiffness(80.0, 300.0, 400.0), 0.9)
+    springs = js.Springs(SHEET, js.thermal.ThermalStiffness(80.0, 300.0, 400.0), 0.9)
     state = warm(SHEET, np.linspace(280.0, 420.0, 20))
     slope = jax.grad(lambda x: springs.energy(state.moved(x, state.velocity)))(state.position)
     for a, b in zip(slope, springs.force(state), strict=True):
@@ -92,7 +92,7 @@ def test_fusing_breaks_for_good():
 
 def test_refreezing_takes_the_present_length():
     """What comes back has no pull and no energy; within the hysteresis, or out of reach, nothing comes back."""
-    again = js.Refreezing(hysteresis=20.0, reach=1.5)
+    again = js.thermal.Refreezing(hysteresis=20.0, reach=1.5)
     _, hot = fused([400.0] * 5, refreezing=again)
     assert not CHAIN.flatten(hot.alive).any()
     _, cool = fused([340.0] * 5, refreezing=again, state=hot)
@@ -102,13 +102,13 @@ def test_refreezing_takes_the_present_length():
     np.testing.assert_allclose(CHAIN.flatten(cold.rest_length), 1.3, rtol=1e-14)
     np.testing.assert_allclose(system.force(cold).x, 0, atol=1e-13)
     assert float(system.energy(cold).potential[0]) == pytest.approx(0, abs=1e-20)
-    _, far = fused([300.0] * 5, refreezing=js.Refreezing(20.0, reach=1.2), state=hot)
+    _, far = fused([300.0] * 5, refreezing=js.thermal.Refreezing(20.0, reach=1.2), state=hot)
     assert not CHAIN.flatten(far.alive).any()
 
 
 def test_refreezing_without_hysteresis():
     """At the melting point itself a spring stays broken; a hair below it comes back."""
-    again = js.Refreezing(hysteresis=0.0, reach=2.0)
+    again = js.thermal.Refreezing(hysteresis=0.0, reach=2.0)
     _, hot = fused([400.0] * 5, refreezing=again)
     _, end = fused([350.0, 350.0, 350.0, 349.99, 349.99], refreezing=again, state=hot)
     assert CHAIN.flatten(end.alive).tolist() == [False, False, True, True]
@@ -116,8 +116,8 @@ def test_refreezing_without_hysteresis():
 
 def test_refreezing_under_expansion():
     """What comes back while its material is cooler or warmer than the reference has no pull there, and the length of that temperature."""
-    springs = js.Springs(CHAIN, 10.0, 1.0, expansion=js.ThermalExpansion(2e-3, 400.0))
-    system = js.System(CHAIN, 1.0, springs, rules=js.Fusing(CHAIN, 350.0, js.Refreezing(20.0, 2.0)))
+    springs = js.Springs(CHAIN, 10.0, 1.0, expansion=js.thermal.ThermalExpansion(2e-3, 400.0))
+    system = js.System(CHAIN, 1.0, springs, rules=js.Fusing(CHAIN, 350.0, js.thermal.Refreezing(20.0, 2.0)))
     hot = js.rollout(system, warm(CHAIN, 400.0, 1.3), js.Still(), 0.1, 1).state
     cold = js.rollout(system, dataclasses.replace(hot, temperature=jnp.full(5, 300.0)), js.Still(), 0.1, 1).state
     assert CHAIN.flatten(cold.alive).all()
@@ -142,22 +142,22 @@ def test_broken_springs_by_where():
 
 
 BARE = js.lattice((4, 5))
-WHOLE_SHEET = js.EdgeField(tuple(jnp.ones(shape, bool) for shape in SHEET.family_shapes))
+WHOLE_SHEET = js.topology.EdgeField(tuple(jnp.ones(shape, bool) for shape in SHEET.family_shapes))
 
 
 @pytest.mark.parametrize(
     ("make", "match"),
     [
-        (lambda: js.ThermalStiffness(-1.0, 300.0, 400.0), "stiffness"),
-        (lambda: js.ThermalStiffness(1.0, 400.0, 400.0), "not below melting"),
-        (lambda: js.ThermalStiffness(1.0, 300.0, 400.0, 0.0), "sharpness"),
-        (lambda: js.Refreezing(-1.0, 1.0), "hysteresis"),
+        (lambda: js.thermal.ThermalStiffness(-1.0, 300.0, 400.0), "stiffness"),
+        (lambda: js.thermal.ThermalStiffness(1.0, 400.0, 400.0), "not below melting"),
+        (lambda: js.thermal.ThermalStiffness(1.0, 300.0, 400.0, 0.0), "sharpness"),
+        (lambda: js.thermal.Refreezing(-1.0, 1.0), "hysteresis"),
         (lambda: js.Fusing(CHAIN, float("nan")), "melting"),
         (lambda: js.Floor((0.0, 0.0), (0.0, 0.0)), "no length"),
         (lambda: js.Floor((0.0, 0.0), (0.0, 1.0), friction=-0.1), "friction"),
         (lambda: js.Floor((0.0, 0.0), (0.0, 1.0), restitution=1.5), "restitution"),
         (
-            lambda: js.System(CHAIN, 1.0, rules=js.Fusing(CHAIN, 1.0, js.Refreezing(1.0, 1.0))).prepare(float),
+            lambda: js.System(CHAIN, 1.0, rules=js.Fusing(CHAIN, 1.0, js.thermal.Refreezing(1.0, 1.0))).prepare(float),
             "one Springs on the net of Fusing, whose rest lengths change; this system has 0",
         ),
         (lambda: js.Fusing(CHAIN, 1.0).begin(dataclasses.replace(warm(CHAIN, 1.0), alive=WHOLE_SHEET)), "of another net than Fusing"),

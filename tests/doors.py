@@ -186,7 +186,7 @@ BY_HAND = {"diffeqsolve", "fit", "check_gradient", "frequency_response", "from_n
 # What the library makes and hands out; nobody else builds it.
 MADE_INSIDE = """
     Account Blocks Energy Equilibrium Finding Fit Gather GradientCheck History Iteration Modes NodeDyads OdeInfo OdeResult Profile
-    Result Resume Scatter Selection SkylineFactor SolveInfo Solves SpringBlocks SpringMatrix Status Surface Reconstructed
+    Result Resume Scatter Selection SkylineFactor SolveInfo Solves SpringBlocks SpringMatrix Status Step Surface Reconstructed
     Undetermined
 """
 
@@ -197,7 +197,7 @@ NO_ARRAYS = """
     ExpansionRule ExplicitHeat Flag Force ForwardEuler GradientMagnitude GradientWarning HalfCells HeatIteration HeatScheme Hooke
     Identity ImageError ImplicitMidpoint Intensity Jacobi JaxCG LBFGS Lattice Law LeastSquares Ledger LinearSolver Linearisation
     Lineax Luminance Molten Multigrid Natural Newton NoCutoff Observation Optax Optimiser Ordering PairLaw Pairs Positive PowerLaw
-    Preconditioner Progress PullLaw Reconstruction Relaxation ReverseCuthillMcKee RungeKutta4 Sampling Secant SemiImplicit
+    Preconditioner Progress PullLaw Reconstruction Relaxation ReverseCuthillMcKee Rule RungeKutta4 Sampling Secant SemiImplicit
     SimulationError Skyline SoftPositive SplitHeat SpringSettings StabilityWarning Stepper StiffnessRule Still Stop StopReason
     StoreAll StoreStates SymmetricSplitHeat SymplecticEuler Tangent TensionOnly ThermalBoundary Topology Transform Unpreconditioned
     VelocityVerlet animate elevation_model energy_ledger equilibrium fit_constants fit_springs from_mesh gradient_magnitude load

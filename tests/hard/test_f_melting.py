@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 
 import jaxspring as js
-from jaxspring.forces.base import Rule
 from jaxspring.status import Status
 
 NET = js.lattice((4, 6), js.STRUCTURAL + js.SHEAR)
 
 
-class CutAt(Rule):
+class CutAt(js.Rule):
     """Breaks the springs across the middle at the end of one step, by the melting point: it heats them for that step."""
 
     step: jnp.ndarray

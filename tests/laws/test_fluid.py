@@ -9,7 +9,6 @@ import pytest
 import scipy.optimize
 
 import jaxspring as js
-from jaxspring.forces.base import Step
 from tests.particles import blob, components, make, slide_force
 
 LAWS = [js.fluid.SlideLaw(1.0, 1.3, 0.1), js.fluid.UnitVectorLaw(1.0, 1.3, 0.1), js.fluid.LennardJones(0.7, 0.9)]
@@ -142,7 +141,7 @@ def test_a_step_too_long_for_a_collision_is_told_in_both_directions():
     slow = state.moved(state.position, 0.1 * state.velocity)
     for before, after, share, is_told in ((slow, state, 1.01, True), (slow, state, 0.99, False), (state, slow, 1.01, False)):
         for sign in (1, -1):
-            status = fluid.update(Step(before, after, jnp.asarray(sign * share * limit)), after)[1]
+            status = fluid.update(js.Step(before, after, jnp.asarray(sign * share * limit)), after)[1]
             assert bool(status.has(js.Flag.DT_LIMIT)) == is_told
 
 

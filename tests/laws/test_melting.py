@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jaxspring as js
-from jaxspring.forces.base import Rule
 from jaxspring.status import Status
 
 NET = js.lattice((3, 4), js.STRUCTURAL + js.SHEAR)
@@ -61,7 +60,7 @@ def test_softening_stays_within_bounds(precision, seed, log_width, log_far, log_
     assert np.abs(np.subtract(smooth, exact)).max() <= FULL * np.log(2) / b + rounding
 
 
-class Warmed(Rule):
+class Warmed(js.Rule):
     """Gives the nodes the temperatures and places of a list, one entry a step."""
 
     temperatures: jax.Array

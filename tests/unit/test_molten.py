@@ -9,7 +9,6 @@ import pytest
 import scipy.integrate
 
 import jaxspring as js
-from jaxspring.forces.base import Step
 from jaxspring.forces.cutoffs import Cutoff
 from jaxspring.numerics import any_lane
 from tests.particles import components
@@ -143,7 +142,7 @@ def test_what_is_solid_drags_counts_and_limits_nothing():
     (overlaps,) = fluid.diagnose(at)
     assert (overlaps.flag, int(overlaps.count), int(overlaps.node)) == (js.Flag.OVERLAP, 1, 0)
     assert float(fluid.collision_dt(at)[0]) == np.inf
-    assert int(fluid.update(Step(at, at, jnp.asarray(1.0)), at)[1].flags) == 0
+    assert int(fluid.update(js.Step(at, at, jnp.asarray(1.0)), at)[1].flags) == 0
 
 
 def test_bound_of_stiffness_of_a_mixed_pair():

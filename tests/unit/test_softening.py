@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import jaxspring as js
-from jaxspring.forces.base import Step
 
 CHAIN = js.lattice(5)
 SHEET = js.lattice((4, 5), js.STRUCTURAL + js.SHEAR)
@@ -129,7 +128,7 @@ def test_a_melting_point_that_slipped_in_is_reported():
     """NaN put in after construction, by which nothing would ever melt, gives INVALID."""
     rule = eqx.tree_at(lambda r: r.melting, js.Fusing(CHAIN, 350.0), jnp.asarray(jnp.nan))
     state = rule.begin(warm(CHAIN, 400.0))
-    assert bool(rule.update(Step(state, state, jnp.asarray(0.1)), state)[1].has(js.Flag.INVALID))
+    assert bool(rule.update(js.Step(state, state, jnp.asarray(0.1)), state)[1].has(js.Flag.INVALID))
 
 
 def test_broken_springs_by_where():
@@ -193,7 +192,7 @@ def on_floor(velocity, friction=0.0, restitution=0.0, height=0.1):
     floor = js.Floor((0.0, 0.0), (0.0, 1.0), friction, restitution)
     before = js.State.from_points(net, [[0.0, height]], [velocity])
     moved = before.moved(before.position + 0.1 * before.velocity, before.velocity)
-    return after_floor(floor, Step(before, moved, jnp.asarray(0.1)), moved)[0]
+    return after_floor(floor, js.Step(before, moved, jnp.asarray(0.1)), moved)[0]
 
 
 def test_floor():
@@ -225,7 +224,7 @@ def test_floor_anywhere(rng):
     x, v = p + rng.normal(size=(6, 3)) * 0.1 + 0.5 * unit, 10 * rng.normal(size=(6, 3))
     before = js.State.from_points(net, x, v)
     moved = before.moved(before.position + 0.1 * before.velocity, before.velocity)
-    end, status = after_floor(js.Floor(p, n), Step(before, moved, jnp.asarray(0.1)), moved)
+    end, status = after_floor(js.Floor(p, n), js.Step(before, moved, jnp.asarray(0.1)), moved)
     flown = x + 0.1 * v
     height = (flown - p) @ unit
     assert 0 < (height < 0).sum() < 6
@@ -237,5 +236,5 @@ def test_floor_anywhere(rng):
 def test_a_floor_does_not_run_backward():
     """What a floor took is gone: a step back in time is INVALID."""
     state = js.State.from_points(CHAIN, CHAIN.grid())
-    status = after_floor(js.Floor((0.0,), (1.0,)), Step(state, state, jnp.asarray(-0.1)), state)[1]
+    status = after_floor(js.Floor((0.0,), (1.0,)), js.Step(state, state, jnp.asarray(-0.1)), state)[1]
     assert bool(status.has(js.Flag.INVALID))

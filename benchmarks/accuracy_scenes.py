@@ -119,7 +119,7 @@ def mesh(n: int = 11) -> Scene:
     y, x = np.mgrid[:48, :56]
     picture = np.sin(0.21 * x + 0.09 * y) + np.sin(-0.13 * x + 0.24 * y + 1.0) + np.exp(-((x - 30) ** 2 + (y - 20) ** 2) / 40)
     scene = Reconstruction(js.Image(picture), (n, n))
-    net, spline = scene.net, js.CubicSpline()
+    net, spline = scene.net, js.images.CubicSpline()
     rule = js.ImageStiffness(smooth(scene.image, SMOOTHING * scene.spacing), 1.0, 30.0, 0.0, radius=0, sampling=spline)
     points = np.concatenate([np.stack([np.ravel(a) for a in scene.rest], axis=1), np.zeros((n * n, 1))], axis=1)
     start = js.State.from_points(net, points)

@@ -72,7 +72,7 @@ def graphs(sizes: list[tuple[int, int]], rounds: int) -> list[dict]:
     """One row per size: the library's default against both of its reductions and the bare scatter form."""
     rows = []
     for n_nodes, n_steps in sizes:
-        by_kind = {kind.__name__: scenes.mesh(n_nodes, reduction=kind) for kind in (js.Gather, js.Scatter)}
+        by_kind = {kind.__name__: scenes.mesh(n_nodes, reduction=kind) for kind in (js.topology.Gather, js.topology.Scatter)}
         default = choose_reduction(n_nodes).__name__
         cases = [Case("bare scatter", *scenes.bare_mesh(*by_kind["Scatter"], DT, n_steps))]
         cases += [Case(kind, *scenes.program(system, state, DT, n_steps)) for kind, (system, state) in by_kind.items()]

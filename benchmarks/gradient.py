@@ -46,7 +46,7 @@ def graphs(sizes: list[tuple[int, int]], rounds: int) -> list[dict]:
     """One row per size: the default against both reductions and the autodiff of the bare scatter form."""
     rows = []
     for n_nodes, n_steps in sizes:
-        by_kind = {kind.__name__: scenes.mesh(n_nodes, reduction=kind) for kind in (js.Gather, js.Scatter)}
+        by_kind = {kind.__name__: scenes.mesh(n_nodes, reduction=kind) for kind in (js.topology.Gather, js.topology.Scatter)}
         default = choose_reduction(n_nodes).__name__
         bare, arrays = scenes.bare_mesh(*by_kind["Scatter"], DT, n_steps)
         by_hand = jax.jit(jax.grad(lambda x, v, k, l, dt, bare=bare: sum((a * a).sum() for a in bare(x, v, k, l, dt)), argnums=(2, 3)))

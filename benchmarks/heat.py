@@ -36,7 +36,7 @@ def block(n: int) -> tuple[js.Lattice, Any, np.ndarray]:
     x, y, z = net.grid(1 / n).T
     conductivity = 10 ** (np.sin(5 * x) * np.cos(4 * y) + 0.5 * np.sin(7 * z) - 0.5)
     start = 300 + 100 * np.exp(-20 * ((x - 0.4) ** 2 + (y - 0.5) ** 2 + (z - 0.6) ** 2))
-    return net, js.conductances(net, conductivity, 1.0), start
+    return net, js.thermal.conductances(net, conductivity, 1.0), start
 
 
 def grid_of(heat: js.Heat) -> np.ndarray:
@@ -50,7 +50,7 @@ def advance(heat: js.Heat, temperature: Any, dt: Any, n_steps: int) -> tuple[Any
     """Temperature, heat and status after the steps."""
     start = js.State.from_points(heat.net, grid_of(heat), temperature=temperature)
     run = js.rollout(js.System(heat.net, 1.0, rules=heat), start, js.Still(), dt, n_steps)
-    return run.state.temperature, js.total_heat(heat, run.state) / js.total_heat(heat, start) - 1, run.status
+    return run.state.temperature, js.thermal.total_heat(heat, run.state) / js.thermal.total_heat(heat, start) - 1, run.status
 
 
 def measured(name: str, heat: js.Heat, start: Any, end_time: float, n_steps: int, limit: float, reference: Any) -> dict[str, Any]:
@@ -80,14 +80,14 @@ def measured(name: str, heat: js.Heat, start: Any, end_time: float, n_steps: int
 
 def schemes(net: js.Lattice) -> dict[str, HeatScheme]:
     """Those for long steps."""
-    plain, grids = js.JaxCG(TOLERANCE), js.JaxCG(TOLERANCE, preconditioner=js.Multigrid(net))
+    plain, grids = js.JaxCG(TOLERANCE), js.JaxCG(TOLERANCE, preconditioner=js.linalg.Multigrid(net))
     return {
-        "SplitHeat": js.SplitHeat(),
-        "SymmetricSplitHeat": js.SymmetricSplitHeat(),
-        "BackwardEulerHeat": js.BackwardEulerHeat(plain),
-        "BackwardEulerHeat, Multigrid": js.BackwardEulerHeat(grids),
-        "CrankNicolsonHeat": js.CrankNicolsonHeat(plain),
-        "CrankNicolsonHeat, Multigrid": js.CrankNicolsonHeat(grids),
+        "SplitHeat": js.thermal.SplitHeat(),
+        "SymmetricSplitHeat": js.thermal.SymmetricSplitHeat(),
+        "BackwardEulerHeat": js.thermal.BackwardEulerHeat(plain),
+        "BackwardEulerHeat, Multigrid": js.thermal.BackwardEulerHeat(grids),
+        "CrankNicolsonHeat": js.thermal.CrankNicolsonHeat(plain),
+        "CrankNicolsonHeat, Multigrid": js.thermal.CrankNicolsonHeat(grids),
     }
 
 
@@ -115,7 +115,7 @@ def main() -> None:
         system = js.System(net, 1.0, rules=js.Heat(net, 1.0, conductance))
         limit = float(js.stable_dt(system, js.State.from_points(net, net.grid(), temperature=start)))
         end_time = 64 * limit
-        exact = js.Heat(net, 1.0, conductance, js.CrankNicolsonHeat(js.JaxCG(1e-11)))
+        exact = js.Heat(net, 1.0, conductance, js.thermal.CrankNicolsonHeat(js.JaxCG(1e-11)))
         reference, _, _ = advance(exact, start, jnp.asarray(0.5 * limit), 128)
         rows = [measured("ExplicitHeat", js.Heat(net, 1.0, conductance), start, end_time, 128, limit, reference)]
         for name, scheme in schemes(net).items():

@@ -27,7 +27,7 @@ PHOTOGRAPHS = ("camera", "coins", "moon", "page", "text", "clock", "brick", "gra
 
 def images(quick: bool) -> Iterator[tuple[str, js.Image]]:
     """Names and images; none needs a download."""
-    yield "jacksboro (elevation)", js.elevation_model()
+    yield "jacksboro (elevation)", js.images.elevation_model()
     from skimage import data
 
     if not quick:

@@ -24,7 +24,7 @@ def sheet(n: int, seed: int = 0) -> tuple[js.System, js.State]:
     return _hung(net, flat, rest, rng)
 
 
-def mesh(n_nodes: int, seed: int = 0, reduction: Any = js.Gather) -> tuple[js.System, js.State]:
+def mesh(n_nodes: int, seed: int = 0, reduction: Any = js.topology.Gather) -> tuple[js.System, js.State]:
     """Random points in a square, joined by Delaunay's triangulation, in space, float32."""
     from scipy.spatial import Delaunay
 

@@ -35,7 +35,7 @@ STEPPERS: dict[str, js.Stepper] = {
     "SymplecticEuler": js.SymplecticEuler(),
     "VelocityVerlet": js.VelocityVerlet(),
     "RungeKutta4": js.RungeKutta4(),
-    "BackwardEuler, Secant": js.BackwardEuler(stiffness=js.Secant()),
+    "BackwardEuler, Secant": js.BackwardEuler(stiffness=js.steppers.Secant()),
     "BackwardEuler": js.BackwardEuler(),
     "BackwardEuler, Newton": js.BackwardEuler(newton=True),
     "ImplicitMidpoint": js.ImplicitMidpoint(),

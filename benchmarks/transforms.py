@@ -60,7 +60,7 @@ def balance(p: jax.Array) -> jax.Array:
     return js.equilibrium(system, start, tolerance=1e-13).state.points[1]
 
 
-def heat(scheme: js.HeatScheme) -> Function:
+def heat(scheme: js.thermal.HeatScheme) -> Function:
     """Scales of conductance and capacity -> temperatures of a block of 2 x 3 nodes after two steps."""
     net = js.lattice((2, 3))
     temperature = np.array([300.0, 340.0, 310.0, 420.0, 305.0, 390.0])
@@ -85,14 +85,14 @@ def bounce(p: jax.Array) -> jax.Array:
     return js.rollout(system, start, js.VelocityVerlet(), 0.15, 2).state.points.ravel()
 
 
-def fluid(pairs: js.Pairs) -> Function:
+def fluid(pairs: js.fluid.Pairs) -> Function:
     """Scales of depth and diameter -> where four particles of a Lennard-Jones fluid with pair drag are after two steps."""
     net = js.Graph.from_edges(np.zeros((0, 2), int), 4)
     points = np.array([[0.0, 0.0], [1.2, 0.1], [0.3, 1.1], [1.5, 1.4]])
 
     def end(p: jax.Array) -> jax.Array:
-        law = js.LennardJones(p[0], p[1])
-        force = js.Fluid(law, cutoff=js.ShiftedForce(2.5), pairs=pairs, drag=js.PairDrag(0.5, 2.0))
+        law = js.fluid.LennardJones(p[0], p[1])
+        force = js.Fluid(law, cutoff=js.fluid.ShiftedForce(2.5), pairs=pairs, drag=js.fluid.PairDrag(0.5, 2.0))
         start = js.State.from_points(net, points, 0.3 * points[::-1])
         return js.rollout(js.System(net, 1.0, force), start, js.VelocityVerlet(), 0.05, 2).state.points.ravel()
 
@@ -123,26 +123,30 @@ STEPPERS: dict[str, Function] = {
     "RungeKutta4": chain(js.RungeKutta4()),
     "SemiImplicit": chain(js.SemiImplicit()),
     "BackwardEuler, linear": chain(js.BackwardEuler(js.JaxCG(tolerance=1e-12))),
-    "BackwardEuler, Newton": chain(js.BackwardEuler(newton=js.Newton(tolerance=1e-13), adjoint=js.ExactSolver(js.CG(tolerance=1e-12)))),
-    "ImplicitMidpoint": chain(js.ImplicitMidpoint(newton=js.Newton(tolerance=1e-13), adjoint=js.ExactSolver(js.CG(tolerance=1e-12)))),
-    "BDF2": chain(js.BDF2(newton=js.Newton(tolerance=1e-13), adjoint=js.ExactSolver(js.CG(tolerance=1e-12)))),
+    "BackwardEuler, Newton": chain(
+        js.BackwardEuler(newton=js.Newton(tolerance=1e-13), adjoint=js.linalg.ExactSolver(js.CG(tolerance=1e-12)))
+    ),
+    "ImplicitMidpoint": chain(
+        js.ImplicitMidpoint(newton=js.Newton(tolerance=1e-13), adjoint=js.linalg.ExactSolver(js.CG(tolerance=1e-12)))
+    ),
+    "BDF2": chain(js.BDF2(newton=js.Newton(tolerance=1e-13), adjoint=js.linalg.ExactSolver(js.CG(tolerance=1e-12)))),
 }
 OTHERS: dict[str, Function] = {
     "CG": chain(js.BackwardEuler(js.CG(tolerance=1e-12))),
-    "CG, Multigrid": chain(js.BackwardEuler(js.CG(tolerance=1e-12, preconditioner=js.Multigrid(js.lattice(3))))),
+    "CG, Multigrid": chain(js.BackwardEuler(js.CG(tolerance=1e-12, preconditioner=js.linalg.Multigrid(js.lattice(3))))),
     "Skyline": chain(js.BackwardEuler(js.Skyline(js.lattice(3)))),
-    "Lineax": chain(js.BackwardEuler(js.Lineax(lineax.CG(rtol=1e-12, atol=1e-14)))),
+    "Lineax": chain(js.BackwardEuler(js.linalg.Lineax(lineax.CG(rtol=1e-12, atol=1e-14)))),
     "equilibrium": balance,
-    "ExplicitHeat": heat(js.ExplicitHeat()),
-    "BackwardEulerHeat": heat(js.BackwardEulerHeat(js.JaxCG(tolerance=1e-13))),
-    "CrankNicolsonHeat": heat(js.CrankNicolsonHeat(js.JaxCG(tolerance=1e-13))),
-    "SplitHeat": heat(js.SplitHeat()),
-    "SymmetricSplitHeat": heat(js.SymmetricSplitHeat()),
+    "ExplicitHeat": heat(js.thermal.ExplicitHeat()),
+    "BackwardEulerHeat": heat(js.thermal.BackwardEulerHeat(js.JaxCG(tolerance=1e-13))),
+    "CrankNicolsonHeat": heat(js.thermal.CrankNicolsonHeat(js.JaxCG(tolerance=1e-13))),
+    "SplitHeat": heat(js.thermal.SplitHeat()),
+    "SymmetricSplitHeat": heat(js.thermal.SymmetricSplitHeat()),
 }
 SCENES: dict[str, Function] = {
     "a bounce with friction": bounce,
-    "fluid, all pairs": fluid(js.AllPairs()),
-    "fluid, neighbour list": fluid(js.NeighbourList(capacity=3, skin=0.3)),
+    "fluid, all pairs": fluid(js.fluid.AllPairs()),
+    "fluid, neighbour list": fluid(js.fluid.NeighbourList(capacity=3, skin=0.3)),
     "melting block": melting,
 }
 

@@ -30,6 +30,7 @@ from jax import lax
 
 import jaxspring as js
 from jaxspring.progress import Stopwatch
+from jaxspring.status import WARNINGS
 
 from . import accuracy_scenes
 from .accuracy_scenes import Scene
@@ -145,7 +146,7 @@ def rows_of(scene: Scene, method: Method, expected: tuple[np.ndarray, float], ha
         (position, flags, steps), run_s = timed(run, constant, setting)
         found = points(scene, position)
         error = float(np.sqrt(np.mean((found - expected[0]) ** 2)) / displacement)
-        is_ok = not int(flags) & ~int(js.status.WARNINGS)
+        is_ok = not int(flags) & ~int(WARNINGS)
         moved = float(np.sqrt(np.mean((found - start) ** 2)) / displacement)
         is_unstable = not (is_ok and moved < FARTHEST)
         row = {"method": method.name, "setting": text, "steps": int(steps), "run_s": run_s, "error": error}

@@ -74,21 +74,23 @@ def number(value: float) -> np.ndarray:
 
 
 DOORS: dict[str, Door] = {
-    "Combined": Door(lambda weights: js.Combined((js.Intensity(), js.Curvature()), weights), {"weights": np.array([1.0, 2.0])}),
+    "Combined": Door(
+        lambda weights: js.images.Combined((js.images.Intensity(), js.images.Curvature()), weights), {"weights": np.array([1.0, 2.0])}
+    ),
     "Convection": Door(
-        lambda **a: js.Convection(net(), **a),
+        lambda **a: js.thermal.Convection(net(), **a),
         {"nodes": PATTERN, "coefficient": per_node(), "ambient": per_node(280), "area": per_node()},
     ),
     "Dashpots": Door(lambda damping: js.Dashpots(net(), damping), {"damping": per_spring()}),
     "DataSprings": Door(lambda stiffness: js.DataSprings(image(), stiffness), {"stiffness": per_node()}),
     "Drag": Door(js.Drag, {"gamma": per_node()}),
-    "EdgeField": Door(lambda value: js.EdgeField((value,)), {"value": per_spring()}),
-    "FixedTemperature": Door(lambda **a: js.FixedTemperature(net(), **a), {"nodes": PATTERN, "temperature": per_node(300)}),
+    "EdgeField": Door(lambda value: js.topology.EdgeField((value,)), {"value": per_spring()}),
+    "FixedTemperature": Door(lambda **a: js.thermal.FixedTemperature(net(), **a), {"nodes": PATTERN, "temperature": per_node(300)}),
     "Floor": Door(
         js.Floor,
         {"point": np.array([0.0, 1.0]), "normal": np.array([0.0, 2.0]), "friction": number(0.25), "restitution": number(0.5)},
     ),
-    "Fluid": Door(lambda core: js.Fluid(js.SlideLaw(1.0, 1.0), core=core), {"core": number(0.125)}),
+    "Fluid": Door(lambda core: js.Fluid(js.fluid.SlideLaw(1.0, 1.0), core=core), {"core": number(0.125)}),
     "Fusing": Door(lambda melting: js.Fusing(net(), melting), {"melting": number(350.0)}),
     "Graph": Door(
         lambda edges, triangles, box: js.Graph.from_edges(edges, N, triangles=triangles, box=box),
@@ -97,9 +99,9 @@ DOORS: dict[str, Door] = {
     ),
     "Gravity": Door(js.Gravity, {"acceleration": np.array([0.0, -9.5]), "mass": per_node()}),
     "Heat": Door(lambda **a: js.Heat(net(), **a), {"capacity": per_node(), "conductance": per_spring(), "source": per_node()}),
-    "HeatFlux": Door(lambda **a: js.HeatFlux(net(), **a), {"nodes": PATTERN, "flux": per_node(), "area": per_node()}),
+    "HeatFlux": Door(lambda **a: js.thermal.HeatFlux(net(), **a), {"nodes": PATTERN, "flux": per_node(), "area": per_node()}),
     "HotPlane": Door(
-        js.HotPlane,
+        js.thermal.HotPlane,
         {
             "point": np.array([0.0, 1.0]),
             "normal": np.array([0.0, 2.0]),
@@ -115,22 +117,22 @@ DOORS: dict[str, Door] = {
     "ImageStiffness": Door(
         lambda **a: js.ImageStiffness(image(), radius=4, **a), {"k_min": number(1.0), "k_max": number(9.0), "sigma": number(1.0)}
     ),
-    "LatentHeat": Door(js.LatentHeat, {"melting": per_node(350), "latent": per_node()}),
-    "LennardJones": Door(js.LennardJones, {"epsilon": number(2.0), "sigma": number(0.5)}),
+    "LatentHeat": Door(js.thermal.LatentHeat, {"melting": per_node(350), "latent": per_node()}),
+    "LennardJones": Door(js.fluid.LennardJones, {"epsilon": number(2.0), "sigma": number(0.5)}),
     "Load": Door(lambda forces: js.Load.from_points(net(), forces), {"forces": np.arange(8.0).reshape(N, 2)}),
     "Motion": Door(lambda moved: js.Motion(moved, lambda t: js.Vector((t,))), {"moved": PATTERN}),
-    "NeighbourList": Door(lambda skin: js.NeighbourList(8, skin), {"skin": number(0.5)}),
-    "PairDrag": Door(js.PairDrag, {"damping": number(2.0), "radius": number(1.5)}),
-    "PixelSprings": Door(lambda stiffness: js.PixelSprings(cast(Any, None), stiffness), {"stiffness": number(2.0)}),
-    "PlainCutoff": Door(js.PlainCutoff, {"radius": number(2.5)}),
+    "NeighbourList": Door(lambda skin: js.fluid.NeighbourList(8, skin), {"skin": number(0.5)}),
+    "PairDrag": Door(js.fluid.PairDrag, {"damping": number(2.0), "radius": number(1.5)}),
+    "PixelSprings": Door(lambda stiffness: js.reconstruction.PixelSprings(cast(Any, None), stiffness), {"stiffness": number(2.0)}),
+    "PlainCutoff": Door(js.fluid.PlainCutoff, {"radius": number(2.5)}),
     "Radiation": Door(
-        lambda **a: js.Radiation(net(), **a),
+        lambda **a: js.thermal.Radiation(net(), **a),
         {"nodes": PATTERN, "emissivity": per_node(0.125), "ambient": per_node(280), "area": per_node()},
     ),
     "Rayleigh": Door(js.Rayleigh, {"mass_rate": number(0.5), "stiffness_time": number(0.25), "mass": per_node()}),
-    "Refreezing": Door(js.Refreezing, {"hysteresis": number(5.0), "reach": number(1.5)}),
-    "ShiftedForce": Door(js.ShiftedForce, {"radius": number(2.5)}),
-    "SlideLaw": Door(js.SlideLaw, {"alpha": number(1.0), "beta": number(2.0), "zeta": number(0.5)}),
+    "Refreezing": Door(js.thermal.Refreezing, {"hysteresis": number(5.0), "reach": number(1.5)}),
+    "ShiftedForce": Door(js.fluid.ShiftedForce, {"radius": number(2.5)}),
+    "SlideLaw": Door(js.fluid.SlideLaw, {"alpha": number(1.0), "beta": number(2.0), "zeta": number(0.5)}),
     "Springs": Door(lambda **a: js.Springs(net(), **a), {"stiffness": per_spring(), "rest_length": per_spring(0.5)}),
     "State": Door(
         lambda **a: js.State.from_points(net(), **a),
@@ -141,31 +143,31 @@ DOORS: dict[str, Door] = {
             "temperature": per_node(300),
         },
     ),
-    "Switched": Door(js.Switched, {"on": number(2.0), "off": number(2.5)}),
+    "Switched": Door(js.fluid.Switched, {"on": number(2.0), "off": number(2.5)}),
     "System": Door(lambda **a: js.System(net(), **a), {"mass": per_node(), "free": PATTERN}),
-    "ThermalExpansion": Door(js.ThermalExpansion, {"coefficient": number(0.5), "reference": number(300.0)}),
+    "ThermalExpansion": Door(js.thermal.ThermalExpansion, {"coefficient": number(0.5), "reference": number(300.0)}),
     "ThermalStiffness": Door(
-        js.ThermalStiffness,
+        js.thermal.ThermalStiffness,
         {"stiffness": per_spring(), "softening": number(300.0), "melting": number(400.0), "sharpness": number(2.0)},
     ),
-    "UnitVectorLaw": Door(js.UnitVectorLaw, {"alpha": number(1.0), "beta": number(2.0), "zeta": number(0.5)}),
+    "UnitVectorLaw": Door(js.fluid.UnitVectorLaw, {"alpha": number(1.0), "beta": number(2.0), "zeta": number(0.5)}),
     "Vector": Door(lambda value: js.Vector((value, value)), {"value": per_node()}),
-    "adaptation": Door(lambda sigma: js.adaptation(image(), sigma, radius=4), {"sigma": number(1.0)}),
+    "adaptation": Door(lambda sigma: js.images.adaptation(image(), sigma, radius=4), {"sigma": number(1.0)}),
     "capacities": Door(
-        lambda **a: js.capacities(net(), **a),
+        lambda **a: js.thermal.capacities(net(), **a),
         {"density": per_node(), "specific_heat": per_node(), "spacing": number(0.5), "section": number(2.0)},
     ),
     "conductances": Door(
-        lambda **a: js.conductances(net(), **a), {"conductivity": per_node(), "spacing": number(0.5), "section": number(2.0)}
+        lambda **a: js.thermal.conductances(net(), **a), {"conductivity": per_node(), "spacing": number(0.5), "section": number(2.0)}
     ),
     "delaunay": Door(js.delaunay, {"points": SQUARE}, on_host=("points",)),
     "from_scipy": Door(js.from_scipy, {"matrix": np.array([[0.0, 2.0], [2.0, 0.0]])}, on_host=("matrix",)),
     "from_triangles": Door(lambda triangles: js.from_triangles(triangles, N), {"triangles": TRIANGLES}, on_host=("triangles",)),
-    "gentle_fluid": Door(js.gentle_fluid, {"spacing": number(0.5), "zeta": number(0.25), "alpha": number(2.0)}),
-    "image_from_array": Door(js.image_from_array, {"pixels": PIXELS}),
+    "gentle_fluid": Door(js.fluid.gentle_fluid, {"spacing": number(0.5), "zeta": number(0.25), "alpha": number(2.0)}),
+    "image_from_array": Door(js.images.image_from_array, {"pixels": PIXELS}),
     "lattice": Door(lambda box: js.lattice((4, 4), periodic=True, box=box), {"box": np.array([4.0, 4.0])}),
     "link_conductances": Door(
-        lambda **a: js.link_conductances(net(), **a), {"conductivity": per_node(), "area": per_spring(), "length": per_spring()}
+        lambda **a: js.thermal.link_conductances(net(), **a), {"conductivity": per_node(), "area": per_spring(), "length": per_spring()}
     ),
     "lumped_mass": Door(
         lambda **a: js.lumped_mass(js.from_triangles(TRIANGLES, N), **a),
@@ -174,7 +176,7 @@ DOORS: dict[str, Door] = {
     ),
     "replace": Door(lambda **a: js.replace(system(), **a), {"stiffness": per_spring(), "rest_length": per_spring(), "mass": per_node()}),
     "rollout": Door(lambda dt: js.rollout(system(), state(), js.SymplecticEuler(), dt, 2).state, {"dt": number(0.0625)}),
-    "smooth": Door(lambda sigma: js.smooth(image(), sigma, radius=4), {"sigma": number(1.0)}),
+    "smooth": Door(lambda sigma: js.images.smooth(image(), sigma, radius=4), {"sigma": number(1.0)}),
     "squared_distance": Door(lambda target: js.squared_distance(jnp.zeros((N, 2)), target), {"target": np.arange(8.0).reshape(N, 2)}),
 }
 
@@ -184,7 +186,7 @@ BY_HAND = {"diffeqsolve", "fit", "check_gradient", "frequency_response", "from_n
 # What the library makes and hands out; nobody else builds it.
 MADE_INSIDE = """
     Account Blocks Energy Equilibrium Finding Fit Gather GradientCheck History Iteration Modes NodeDyads OdeInfo OdeResult Profile
-    Result Resume Scatter Selection SkylineFactor SolveInfo Solves SpringBlocks SpringMatrix Status Surface Reconstructed
+    Result Resume Scatter Selection SkylineFactor SolveInfo Solves SpringBlocks SpringMatrix Status Step Surface Reconstructed
     Undetermined
 """
 
@@ -195,7 +197,7 @@ NO_ARRAYS = """
     ExpansionRule ExplicitHeat Flag Force ForwardEuler GradientMagnitude GradientWarning HalfCells HeatIteration HeatScheme Hooke
     Identity ImageError ImplicitMidpoint Intensity Jacobi JaxCG LBFGS Lattice Law LeastSquares Ledger LinearSolver Linearisation
     Lineax Luminance Molten Multigrid Natural Newton NoCutoff Observation Optax Optimiser Ordering PairLaw Pairs Positive PowerLaw
-    Preconditioner Progress PullLaw Reconstruction Relaxation ReverseCuthillMcKee RungeKutta4 Sampling Secant SemiImplicit
+    Preconditioner Progress PullLaw Reconstruction Relaxation ReverseCuthillMcKee Rule RungeKutta4 Sampling Secant SemiImplicit
     SimulationError Skyline SoftPositive SplitHeat SpringSettings StabilityWarning Stepper StiffnessRule Still Stop StopReason
     StoreAll StoreStates SymmetricSplitHeat SymplecticEuler Tangent TensionOnly ThermalBoundary Topology Transform Unpreconditioned
     VelocityVerlet animate elevation_model energy_ledger equilibrium fit_constants fit_springs from_mesh gradient_magnitude load

@@ -13,7 +13,7 @@ def free_net(n):
 def make(points, mass=1.0, law=None, velocities=None, **options):
     """A system with one fluid, and its state."""
     net = free_net(len(points))
-    fluid = js.Fluid(js.SlideLaw(1.0, 1.0, zeta=0.1) if law is None else law, **options)
+    fluid = js.Fluid(js.fluid.SlideLaw(1.0, 1.0, zeta=0.1) if law is None else law, **options)
     return js.System(net, mass=mass, forces=fluid), js.State.from_points(net, points, velocities)
 
 

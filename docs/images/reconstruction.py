@@ -20,7 +20,7 @@ from jaxspring.scenes.reconstruction.scene import Reconstruction
 
 def main(folder):
     """Six panels: image, fitted mesh, and for either mesh the surface and its error on one scale."""
-    image = js.elevation_model()
+    image = js.images.elevation_model()
     values = np.asarray(image.values, float)
     mesh = np.load(folder / "mesh.npz")
     x, y, z = mesh["points"].T

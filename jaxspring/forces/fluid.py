@@ -59,7 +59,7 @@ class Fluid(Force):
         ValueError: a list without a cut-off, a core or a drag that does not fit inside it.
 
     >>> net = js.Graph.from_edges(np.zeros((0, 2), int), 2)
-    >>> system = js.System(net, mass=1.0, forces=Fluid(js.SlideLaw(alpha=1.0, beta=1.0)))
+    >>> system = js.System(net, mass=1.0, forces=Fluid(js.fluid.SlideLaw(alpha=1.0, beta=1.0)))
     >>> apart = js.State.from_points(net, [[0.0, 0.0], [2.0, 0.0]])
     >>> print(system.force(apart).x)
     [ 0.375 -0.375]

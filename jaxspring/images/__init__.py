@@ -1,43 +1,32 @@
 """Images: sampling between pixels, smoothing, observation functions, loading. Source of the physics: slides "Adaptive Meshes"."""
 
-from .files import MAX_PIXELS, Channel, ImageError, Luminance, elevation_model, image_from_array, load_image
-from .image import Image, Surface
-from .observation import (
-    Combined,
-    Curvature,
-    GradientMagnitude,
-    Intensity,
-    Observation,
-    adaptation,
-    gradient_magnitude,
-    image_gradient,
-    principal_curvatures,
-)
-from .sampling import Bilinear, CubicSpline, Sampling
-from .smoothing import smooth, smoothing_radius
+from __future__ import annotations
 
-__all__ = [
-    "MAX_PIXELS",
-    "Bilinear",
-    "Channel",
-    "Combined",
-    "CubicSpline",
-    "Curvature",
-    "GradientMagnitude",
-    "Image",
-    "ImageError",
-    "Intensity",
-    "Luminance",
-    "Observation",
-    "Sampling",
-    "Surface",
-    "adaptation",
-    "elevation_model",
-    "gradient_magnitude",
-    "image_from_array",
-    "image_gradient",
-    "load_image",
-    "principal_curvatures",
-    "smooth",
-    "smoothing_radius",
-]
+from typing import TYPE_CHECKING
+
+from .._lazy import face as _face
+
+if TYPE_CHECKING:  # written by `python -m tests.face`
+    from .surface import Surface as Surface
+    from .sampling import Bilinear as Bilinear
+    from .sampling import CubicSpline as CubicSpline
+    from .sampling import Sampling as Sampling
+    from .smoothing import smooth as smooth
+    from .smoothing import smoothing_radius as smoothing_radius
+    from .observation import Combined as Combined
+    from .observation import Curvature as Curvature
+    from .observation import GradientMagnitude as GradientMagnitude
+    from .observation import Intensity as Intensity
+    from .observation import Observation as Observation
+    from .observation import adaptation as adaptation
+    from .observation import gradient_magnitude as gradient_magnitude
+    from .observation import principal_curvatures as principal_curvatures
+    from .files import Channel as Channel
+    from .files import ImageError as ImageError
+    from .files import Luminance as Luminance
+    from .files import elevation_model as elevation_model
+    from .files import image_from_array as image_from_array
+    from .image import Image as Image
+    from .files import load_image as load_image
+else:
+    __all__, __getattr__, __dir__ = _face(__name__)

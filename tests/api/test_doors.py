@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import jaxspring as js
+from tests import face
 from tests.doors import BY_HAND, DOORS, MADE_INSIDE, NO_ARRAYS, at_offset, snapshot, spoil
 
 FIELDS = [(name, field) for name, door in DOORS.items() for field in door.fields]
@@ -18,7 +18,7 @@ each_field = pytest.mark.parametrize(("name", "field"), FIELDS, ids=lambda value
 def test_every_public_name_has_its_door():
     """A public class or function stands in the table of doors, or among those that take no array of the user's."""
     listed = [set(DOORS), BY_HAND, set(MADE_INSIDE.split()), set(NO_ARRAYS.split())]
-    public = {name for name in js.__all__ if inspect.isclass(getattr(js, name)) or inspect.isroutine(getattr(js, name))}
+    public = {name for name, thing in face.public().items() if inspect.isclass(thing) or inspect.isroutine(thing)}
     missing = sorted(public - set().union(*listed))
     assert not missing, f"tests/doors.py does not know {', '.join(missing)}: say how each is built from arrays, or that it takes none"
     assert sum(map(len, listed)) == len(set().union(*listed)), "a name is listed twice"

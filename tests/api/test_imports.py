@@ -10,6 +10,7 @@ import sys
 
 import pytest
 
+from jaxspring._lazy import SUBMODULES
 from tests import source
 
 HEAVY = ["diffrax", "optax", "optimistix", "scipy", "matplotlib", "PIL", "trimesh"]
@@ -33,6 +34,39 @@ def test_import_loads_nothing_heavy():
     """`import jaxspring` loads none of the packages that only some users need."""
     loaded = json.loads(python("import json, sys, jaxspring; print(json.dumps(sorted(sys.modules)))"))
     assert [name for name in HEAVY if name in loaded] == []
+
+
+def test_names_and_submodules_are_loaded_on_first_use():
+    """`import jaxspring` loads the table of names alone; a submodule comes by its attribute and brings nothing; a name brings its home."""
+    code = (
+        "import json, sys, jaxspring as js\n"
+        "def ours(): return sorted(name for name in sys.modules if name.startswith('jaxspring.'))\n"
+        "seen = [ours()]\n"
+        f"faces = [getattr(js, name) for name in {SUBMODULES!r}]\n"
+        "seen.append(ours())\n"
+        "js.linalg.Natural\n"
+        "seen.append(ours())\n"
+        "print(json.dumps(seen))"
+    )
+    at_import, faces, home = json.loads(python(code))
+    assert at_import == ["jaxspring._lazy", "jaxspring._names", "jaxspring._version"]
+    assert set(faces) - set(at_import) == {f"jaxspring.{name}" for name in SUBMODULES}
+    assert "jaxspring.linalg.ordering" in home
+    assert not {"jaxspring.system", "jaxspring.forces", "jaxspring.linalg.cg"} & set(home)
+
+
+def test_submodules_are_imported_as_any_module():
+    """`import jaxspring.linalg` and `from jaxspring.thermal import ...` work without the top being named first, and so does a star."""
+    python("import jaxspring.linalg; jaxspring.linalg.Natural; jaxspring.Vector")
+    python(
+        "from jaxspring.thermal import Convection, Heat\n"
+        "from jaxspring import BackwardEuler, thermal\n"
+        "from jaxspring.fluid import *\n"
+        "SlideLaw, AllPairs, thermal.Convection\n"
+        # A package that is also the home of other modules gives these as well.
+        "from jaxspring.linalg import cg, Jacobi\n"
+        "assert cg.__name__ == 'jaxspring.linalg.cg'"
+    )
 
 
 def test_no_module_makes_an_array_when_imported():

@@ -11,6 +11,8 @@ LAYERS = {
     "_version": 0,
     "_arrays": 0,
     "_checks": 0,
+    "_lazy": 0,
+    "_names": 0,  # a table of strings, though of the names of all layers
     "numerics": 0,
     "facts": 0,
     "printing": 0,
@@ -27,6 +29,7 @@ LAYERS = {
     "numbering": 5,  # what a file holds of nodes and springs
     "forces": 3,
     "thermal": 3,
+    "fluid": 3,  # public names of forces
     "masses": 4,
     "nodes": 4,
     "bound": 4,
@@ -48,6 +51,7 @@ LAYERS = {
     "plots": 7,
     "export": 7,  # files for viewers
     "scenes": 8,
+    "reconstruction": 8,  # public names of a scene
     "cli": 8,
     "__main__": 9,
     "__init__": 9,  # the public names

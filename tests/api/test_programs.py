@@ -70,7 +70,7 @@ def test_no_scatter(net):
 
 def test_a_scatter_would_show():
     """The test above can fail: the other kind of graph does scatter."""
-    net = js.Graph.from_edges(SHEET.edges, 30, reduction=js.Scatter)
+    net = js.Graph.from_edges(SHEET.edges, 30, reduction=js.topology.Scatter)
     k, l = (np.full(net.n_springs, c) for c in (20.0, 1.0))
     assert "scatter" in jax.jit(loss_of(net)).lower(k, l).as_text()
 
@@ -225,10 +225,10 @@ def test_each_rule_of_temperature_adds_its_own_operations():
     k = np.full(N - 1, 10.0)
     cold = warm_rollout(k, None)
     assert warm_rollout(k, 300.0) == cold
-    soft = warm_rollout(js.ThermalStiffness(10.0, 300.0, 350.0), 300.0)
-    smooth = warm_rollout(js.ThermalStiffness(10.0, 300.0, 350.0, 20.0), 300.0)
+    soft = warm_rollout(js.thermal.ThermalStiffness(10.0, 300.0, 350.0), 300.0)
+    smooth = warm_rollout(js.thermal.ThermalStiffness(10.0, 300.0, 350.0, 20.0), 300.0)
     fused = warm_rollout(k, 300.0, js.Fusing(CHAIN, 350.0))
-    again = warm_rollout(k, 300.0, js.Fusing(CHAIN, 350.0, js.Refreezing(10.0, 2.0)))
+    again = warm_rollout(k, 300.0, js.Fusing(CHAIN, 350.0, js.thermal.Refreezing(10.0, 2.0)))
     # The mean is a slice, an addition and a multiplication, and the ramp a difference, a division and two bounds. The full stiffness is
     # brought to the extended range of springs, where it is zero, as every stiffness is.
     ramp = Counter(subtract=2, divide=1, maximum=1, minimum=1)

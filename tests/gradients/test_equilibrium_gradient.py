@@ -7,7 +7,7 @@ import pytest
 
 import jaxspring as js
 
-EXACT = js.ExactSolver(js.CG(tolerance=1e-13))
+EXACT = js.linalg.ExactSolver(js.CG(tolerance=1e-13))
 
 
 def arch():

@@ -11,7 +11,7 @@ import jaxspring as js
 from tests.particles import blob, make
 
 pytestmark = pytest.mark.slow
-CHOICES = pytest.mark.parametrize("pairs", [js.AllPairs(tile=5), js.NeighbourList(64, 0.3)], ids=["tiles", "list"])
+CHOICES = pytest.mark.parametrize("pairs", [js.fluid.AllPairs(tile=5), js.fluid.NeighbourList(64, 0.3)], ids=["tiles", "list"])
 
 
 def fluid_of(pairs, rng, n=20):
@@ -53,8 +53,8 @@ def test_gradient_of_a_rollout(pairs, rng):
     first = state.moved(state.position, 2 * along)
 
     def loss(h):
-        changed = js.SlideLaw(1.0 + 0.3 * h, 1.0, 0.1)
-        fluid = js.Fluid(changed, cutoff=js.ShiftedForce(2.5), pairs=pairs)
+        changed = js.fluid.SlideLaw(1.0 + 0.3 * h, 1.0, 0.1)
+        fluid = js.Fluid(changed, cutoff=js.fluid.ShiftedForce(2.5), pairs=pairs)
         moved = first.moved(first.position + h * along, first.velocity)
         end = js.rollout(js.System(system.net, system.mass, fluid), moved, js.SymplecticEuler(), 5e-3, 12).state
         return dot(end.position, end.position)
@@ -86,7 +86,7 @@ def test_derivatives_by_everything(pairs, rng):
     """A dragged, half molten fluid of uneven masses, by positions, speeds, masses and constants: the dot test, and central differences."""
     points, n = blob(rng, 20), 20
     net = js.Graph.from_edges([[i, i + 1] for i in range(0, n // 2)], n)
-    alive = js.EdgeField((jnp.ones(net.n_springs, bool),))
+    alive = js.topology.EdgeField((jnp.ones(net.n_springs, bool),))
     start = js.State.from_points(net, points, rng.normal(size=(n, 3)))
     start = dataclasses.replace(start, alive=alive)
     weights = js.Vector(tuple(jnp.asarray(rng.normal(size=n)) for _ in range(3)))

@@ -7,13 +7,13 @@ import pytest
 
 import jaxspring as js
 
-FINE, ITERATION = js.JaxCG(tolerance=1e-13), js.HeatIteration(tolerance=1e-14)
+FINE, ITERATION = js.JaxCG(tolerance=1e-13), js.thermal.HeatIteration(tolerance=1e-14)
 SCHEMES = [
-    (js.ExplicitHeat(), 0.1),
-    (js.BackwardEulerHeat(FINE, ITERATION), 1.0),
-    (js.CrankNicolsonHeat(FINE, ITERATION), 0.3),
-    (js.SplitHeat(ITERATION), 1.0),
-    (js.SymmetricSplitHeat(ITERATION), 0.3),
+    (js.thermal.ExplicitHeat(), 0.1),
+    (js.thermal.BackwardEulerHeat(FINE, ITERATION), 1.0),
+    (js.thermal.CrankNicolsonHeat(FINE, ITERATION), 0.3),
+    (js.thermal.SplitHeat(ITERATION), 1.0),
+    (js.thermal.SymmetricSplitHeat(ITERATION), 0.3),
 ]
 NET = js.lattice((3, 4))
 START = np.array([300.0, 310, 320, 330, 305, 315, 325, 380, 352, 361, 370, 390])
@@ -27,12 +27,12 @@ def loss(scheme, dt):
     def of(p):
         melting, latent, conductivity, capacity, power = p
         boundaries = (
-            js.FixedTemperature(NET, np.arange(12) == 0, lambda t: 300.0 + t),
-            js.Radiation(NET, np.arange(12) == 11, 0.8, 600.0, 0.05),
+            js.thermal.FixedTemperature(NET, np.arange(12) == 0, lambda t: 300.0 + t),
+            js.thermal.Radiation(NET, np.arange(12) == 11, 0.8, 600.0, 0.05),
         )
         source = power * jnp.asarray(HEATER.reshape(3, 4), p.dtype)
-        g = js.conductances(NET, conductivity, 1.0)
-        heat = js.Heat(NET, capacity, g, scheme, boundaries, source, latent=js.LatentHeat(melting, latent))
+        g = js.thermal.conductances(NET, conductivity, 1.0)
+        heat = js.Heat(NET, capacity, g, scheme, boundaries, source, latent=js.thermal.LatentHeat(melting, latent))
         start = js.State.from_points(NET, NET.grid(), temperature=START)
         end = js.rollout(js.System(NET, 1.0, rules=heat), start, js.Still(), dt, 4)
         return jnp.sum(PROBE * jnp.concatenate([jnp.ravel(end.state.temperature), jnp.ravel(end.state.enthalpy)])), end.status
@@ -41,7 +41,7 @@ def loss(scheme, dt):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("scheme", "dt"), SCHEMES, ids=lambda p: type(p).__name__ if isinstance(p, js.HeatScheme) else "")
+@pytest.mark.parametrize(("scheme", "dt"), SCHEMES, ids=lambda p: type(p).__name__ if isinstance(p, js.thermal.HeatScheme) else "")
 def test_reverse_mode_is_the_difference(scheme, dt):
     """Melting point, latent heat, conductivity, capacity, heater power, with nodes that melt, a held one and radiation: to 1e-6."""
     of = loss(scheme, dt)
@@ -67,7 +67,7 @@ def test_forward_mode_is_reverse_mode():
 @pytest.mark.slow
 def test_a_step_that_was_not_found_has_no_gradient():
     """One iteration where more are needed: SOLVER, and NaN, never the derivative of a half-found temperature."""
-    of = loss(js.BackwardEulerHeat(iteration=js.HeatIteration(max_iter=1)), 1.0)
+    of = loss(js.thermal.BackwardEulerHeat(iteration=js.thermal.HeatIteration(max_iter=1)), 1.0)
     gradient, status = jax.grad(of, has_aux=True)(jnp.asarray(AT))
     assert bool(status.has(js.Flag.SOLVER))
     assert np.all(np.isnan(gradient))

@@ -8,7 +8,7 @@ import pytest
 import jaxspring as js
 
 TIGHT = js.JaxCG(tolerance=1e-12)
-EXACT = js.ExactSolver(js.CG(tolerance=1e-12))
+EXACT = js.linalg.ExactSolver(js.CG(tolerance=1e-12))
 FINE = js.Newton(tolerance=1e-13, max_iter=300)
 
 STEPPERS = [

@@ -11,7 +11,7 @@ DENSITY, SPECIFIC_HEAT, LATENT = 6000.0, 400.0, 8e4  # kg/m^3, J/(kg K), J/kg: a
 COLD, HOT = 290.0, 340.0  # K
 TRUE = {"conductivity": 30.0, "melting": 305.0}  # W/(m K), K
 FIRST = {"conductivity": 18.0, "melting": 320.0}  # 40 % too low; twice as far above COLD
-CAPACITY = js.capacities(NET, DENSITY, SPECIFIC_HEAT, SPACING, THICKNESS)
+CAPACITY = js.thermal.capacities(NET, DENSITY, SPECIFIC_HEAT, SPACING, THICKNESS)
 HEATED = (NET.grid()[:, 0] == 0) & (NET.grid()[:, 1] < 6)  # half of one side: isotherms are curved
 START = js.State.from_points(NET, NET.grid(SPACING), temperature=COLD)
 
@@ -21,10 +21,10 @@ def film(p):
     heat = js.Heat(
         NET,
         CAPACITY,
-        js.conductances(NET, p["conductivity"], SPACING, THICKNESS),
-        js.ExplicitHeat(),
-        js.FixedTemperature(NET, HEATED, HOT),
-        latent=js.LatentHeat(p["melting"], LATENT * DENSITY * SPACING**2 * THICKNESS),
+        js.thermal.conductances(NET, p["conductivity"], SPACING, THICKNESS),
+        js.thermal.ExplicitHeat(),
+        js.thermal.FixedTemperature(NET, HEATED, HOT),
+        latent=js.thermal.LatentHeat(p["melting"], LATENT * DENSITY * SPACING**2 * THICKNESS),
     )
     # 1 s is half the limit of an explicit step at the true conductivity.
     run = js.rollout(js.System(NET, 1.0, rules=heat), START, js.Still(), 1.0, 600, save_every=20, observe=lambda state: state.temperature)

@@ -18,7 +18,7 @@ PIXEL = (4, 5)
 def topology(kind):
     if kind == "lattice":
         return SHEET
-    return js.Graph.from_edges(SHEET.edges, 20, reduction=js.Gather if kind == "gather" else js.Scatter)
+    return js.Graph.from_edges(SHEET.edges, 20, reduction=js.topology.Gather if kind == "gather" else js.topology.Scatter)
 
 
 def parameters():
@@ -159,7 +159,7 @@ def long_loss(net, n_steps, save_every=None, observe=None):
 )
 def test_memory_of_a_long_gradient(kind, n_steps, save_every):
     """By the program's own analysis 10,000 steps of 100 nodes need at most 2 MiB of temporaries for the gradient by every k and l."""
-    net = HUNDRED if kind == "lattice" else js.Graph.from_edges(HUNDRED.edges, 100, reduction=js.Gather)
+    net = HUNDRED if kind == "lattice" else js.Graph.from_edges(HUNDRED.edges, 100, reduction=js.topology.Gather)
     loss = long_loss(net, n_steps, save_every, kinetic if save_every else None)
     k = jnp.full(net.n_springs, 20.0)
     program = jax.jit(jax.grad(loss, argnums=(0, 1))).lower(k, jnp.ones_like(k)).compile()

@@ -14,10 +14,10 @@ from jaxspring.status import Flag, StabilityWarning
 from tests.reference import Traces, chaotic_net, relative_error, spring_forces
 
 PAIR = np.array([[0.0, 0.0, 0.0], [1.5, 0.0, 0.0]])
-BOTH_WAYS = pytest.mark.parametrize("reduction", [js.Gather, js.Scatter])
+BOTH_WAYS = pytest.mark.parametrize("reduction", [js.topology.Gather, js.topology.Scatter])
 
 
-def pair_of_springs(stiffness, edges=((0, 1),), reduction=js.Gather):
+def pair_of_springs(stiffness, edges=((0, 1),), reduction=js.topology.Gather):
     net = js.Graph.from_edges(edges, 2, reduction=reduction)
     return js.System(net, 1.0, js.Springs(net, stiffness, 1.0)), js.State.from_points(net, PAIR)
 
@@ -321,7 +321,7 @@ def test_a17_a_large_net_against_numpy(rng, dtype, kind):
     net = js.lattice((150, 150), js.STRUCTURAL + js.SHEAR)
     assert (net.n_nodes, net.n_springs) == (22_500, 89_102)
     if kind != "lattice":
-        net = js.Graph.from_edges(net.edges, net.n_nodes, reduction=js.Gather if kind == "gather" else js.Scatter)
+        net = js.Graph.from_edges(net.edges, net.n_nodes, reduction=js.topology.Gather if kind == "gather" else js.topology.Scatter)
     points = (np.c_[js.lattice((150, 150)).grid(), np.zeros(22_500)] + 0.1 * rng.normal(size=(22_500, 3))).astype(dtype)
     k, l = (rng.uniform(0.5, 1.5, 89_102).astype(dtype) for _ in range(2))
     springs, state = js.Springs(net, k, l), js.State.from_points(net, points)

@@ -42,9 +42,9 @@ def test_a12_implicit_negative_stiffness():
     net = js.lattice(2)
     start = js.State.from_points(net, [[0.0], [1.5]])
     system = js.System(net, 1.0, js.Springs(net, -10.0, 1.0, allow_negative_stiffness=True))
-    exact = js.rollout(system, start, js.BackwardEuler(stiffness=js.ExactTangent()), 1.0, 1)
+    exact = js.rollout(system, start, js.BackwardEuler(stiffness=js.steppers.ExactTangent()), 1.0, 1)
     assert bool(exact.status.has(Flag.CG_INDEFINITE))
-    assert int(js.rollout(system, start, js.BackwardEuler(stiffness=js.ExactTangent()), 0.0, 1).status.flags) == Flag.OK
+    assert int(js.rollout(system, start, js.BackwardEuler(stiffness=js.steppers.ExactTangent()), 0.0, 1).status.flags) == Flag.OK
     clamped = js.rollout(system, start, js.BackwardEuler(), 1.0, 1)
     assert bool(clamped.status.is_ok)
     # a = -k (r - l) / m = 5 m/s^2 outward on either node, one second long.
@@ -96,13 +96,13 @@ def test_b6_a_squeezed_cloth():
         blocks = system.bind(start.dtype).stiffness_blocks(start, kind)
         return np.linalg.eigvalsh(np.asarray(system.matrix(blocks, start).to_dense()))
 
-    assert eigenvalues(js.ExactTangent())[0] < -1e4
-    assert eigenvalues(js.Tangent())[0] >= -1e-9
+    assert eigenvalues(js.steppers.ExactTangent())[0] < -1e4
+    assert eigenvalues(js.steppers.Tangent())[0] >= -1e-9
     clamped = js.rollout(system, start, js.BackwardEuler(js.CG()), 100 * LIMIT, 1)
     # The sheet springs open, and gains energy in so long a step: that is told, too. The solve itself is sound.
     assert not bool(clamped.status.has(Flag.CG_INDEFINITE))
     assert float(clamped.info.solves.residual) <= 1e-8
-    exact = js.rollout(system, start, js.BackwardEuler(js.CG(), stiffness=js.ExactTangent()), 100 * LIMIT, 1)
+    exact = js.rollout(system, start, js.BackwardEuler(js.CG(), stiffness=js.steppers.ExactTangent()), 100 * LIMIT, 1)
     assert bool(exact.status.has(Flag.CG_INDEFINITE))
 
 

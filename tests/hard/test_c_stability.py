@@ -22,7 +22,7 @@ def one_step(system, start, stepper, dt):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("preconditioner", [js.BlockJacobi(), js.Jacobi()], ids=lambda p: type(p).__name__)
+@pytest.mark.parametrize("preconditioner", [js.linalg.BlockJacobi(), js.linalg.Jacobi()], ids=lambda p: type(p).__name__)
 def test_c5_stiffness_over_eight_decades(preconditioner, dtype):
     """C5: springs of 1e-4 to 1e4 N/m in one cloth, dt = 100 times the limit: OK within 2,200 iterations, with the true residual."""
     system, start, _ = cloth(12, dtype)

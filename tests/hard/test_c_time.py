@@ -140,7 +140,7 @@ def test_c14_momentum(rng, stepper, kind):
     sheet = js.lattice((6, 6), js.STRUCTURAL + js.SHEAR)
     net = sheet
     if kind != "lattice":
-        net = js.Graph.from_edges(sheet.edges, 36, reduction=js.Gather if kind == "gather" else js.Scatter)
+        net = js.Graph.from_edges(sheet.edges, 36, reduction=js.topology.Gather if kind == "gather" else js.topology.Scatter)
     points = np.c_[sheet.grid(), np.zeros(36)] + 0.1 * rng.normal(size=(36, 3))
     mass = rng.uniform(0.5, 2.0, 36)
     state = js.State.from_points(net, points, rng.normal(size=(36, 3)))

@@ -112,7 +112,7 @@ def test_d5_an_overflow_is_reported():
     loss, points = squeezed(400)
     found = js.fit(loss, points, js.Adam(0.1), n_iterations=5)
     assert found.status.has(Flag.NONFINITE)
-    assert found.reason is js.StopReason.FAILED
+    assert found.reason is js.inverse.StopReason.FAILED
     assert found.history.loss.tolist() == [0]
     assert not np.isfinite(found.history.gradient_norm).any()
     np.testing.assert_array_equal(found.parameters, points)
@@ -164,7 +164,7 @@ def test_d8_dot_test(rng, stepper, kind, dtype):
     """<J u, w> = <u, J' w> for a step of every stepper, with random u and w: 1e-12 in float64, 1e-4 in float32."""
     net = js.lattice((4, 5))
     if kind != "lattice":
-        net = js.Graph.from_edges(net.edges, 20, reduction=js.Gather if kind == "gather" else js.Scatter)
+        net = js.Graph.from_edges(net.edges, 20, reduction=js.topology.Gather if kind == "gather" else js.topology.Scatter)
 
     def step(inputs):
         x, v, k, l, mass, gamma, dt = inputs
@@ -253,7 +253,7 @@ def test_d9_every_parameter(scene, name):
 
 def test_d11_models_with_whole_numbers():
     """eqx.filter_grad differentiates a system that holds integer tables; plain jax.grad refuses it with an error that names the dtype."""
-    net = js.Graph.from_edges([(0, 1), (1, 2)], 3, reduction=js.Gather)
+    net = js.Graph.from_edges([(0, 1), (1, 2)], 3, reduction=js.topology.Gather)
     system = js.System(net, 1.0, js.Springs(net, [1.0, 2.0], 1.0))
     state = js.State.from_points(net, [[0.0], [2.0], [5.0]])
 

@@ -13,7 +13,7 @@ HALF = np.array([300.0, 310.0, 340.0, 390.0, 395.0])
 
 def tip(melting, sharpness, softening=330.0, temperature=HALF):
     """Place of a hanging chain's tip [m] after 60 steps."""
-    springs = js.Springs(NET, js.ThermalStiffness(60.0, softening, melting, sharpness), 1.0)
+    springs = js.Springs(NET, js.thermal.ThermalStiffness(60.0, softening, melting, sharpness), 1.0)
     rules = js.Fusing(NET, melting) if sharpness is None else ()
     system = js.System(NET, 1.0, (springs, js.Gravity((2.0,)), js.Drag(0.4)), np.arange(5) > 0, rules=rules)
     state = js.State.from_points(NET, NET.grid(), temperature=temperature)

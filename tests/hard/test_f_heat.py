@@ -16,8 +16,8 @@ SPACING, CONDUCTIVITY = 0.1, 2.0
 
 def body(net, scheme, **more):
     """A sheet of unit volumetric heat capacity and thickness, and its heat rule."""
-    c = js.capacities(net, 1.0, 1.0, SPACING)
-    return js.Heat(net, c, js.conductances(net, CONDUCTIVITY, SPACING), scheme, **more)
+    c = js.thermal.capacities(net, 1.0, 1.0, SPACING)
+    return js.Heat(net, c, js.thermal.conductances(net, CONDUCTIVITY, SPACING), scheme, **more)
 
 
 def go(heat, temperature, dt, n_steps):
@@ -27,13 +27,13 @@ def go(heat, temperature, dt, n_steps):
 
 def drift(heat, start, end):
     """Relative change of the body's heat."""
-    return abs(float(js.total_heat(heat, end) / js.total_heat(heat, start)) - 1)
+    return abs(float(js.thermal.total_heat(heat, end) / js.thermal.total_heat(heat, start)) - 1)
 
 
 @pytest.mark.slow
 def test_f1_explicit_heat_at_its_limit(rng):
     """F1: 40 x 40, 400 steps at dt = h^2 / (4 a): no new extreme, heat kept to 1e-14; at 1.05 of it DT_LIMIT, and it does blow up."""
-    heat, limit = body(GRID, js.ExplicitHeat()), SPACING**2 / (4 * CONDUCTIVITY)
+    heat, limit = body(GRID, js.thermal.ExplicitHeat()), SPACING**2 / (4 * CONDUCTIVITY)
     t = rng.uniform(300, 400, 1600)
     run, start = go(heat, t, limit, 400)
     assert int(run.status.flags) == 0
@@ -56,7 +56,7 @@ def test_f2_a_cosine_for_500_steps():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scheme", [js.BackwardEulerHeat(), js.SplitHeat()], ids=lambda s: type(s).__name__)
+@pytest.mark.parametrize("scheme", [js.thermal.BackwardEulerHeat(), js.thermal.SplitHeat()], ids=lambda s: type(s).__name__)
 def test_f3_steps_of_any_length(scheme, rng):
     """F3: dt = 10, 1e4 and 1e8 times the explicit limit: no new extreme, heat kept to 1e-13, and the mean in the end; a tolerance that
     rounding does not allow is reported, or reached.
@@ -71,8 +71,8 @@ def test_f3_steps_of_any_length(scheme, rng):
         assert t.min() - 1e-6 <= end.min() <= end.max() <= t.max() + 1e-6
         assert drift(heat, start, run.state) <= 1e-13
     np.testing.assert_allclose(end, t.mean(), rtol=1e-12)
-    if isinstance(scheme, js.BackwardEulerHeat):
-        tight, _ = go(body(net, js.BackwardEulerHeat(js.JaxCG(tolerance=1e-15))), t, 1e8 * SPACING**2, 1)
+    if isinstance(scheme, js.thermal.BackwardEulerHeat):
+        tight, _ = go(body(net, js.thermal.BackwardEulerHeat(js.JaxCG(tolerance=1e-15))), t, 1e8 * SPACING**2, 1)
         assert bool(tight.status.has(Flag.CG_MAXITER)) or np.ptp(tight.state.temperature) < 1e-6
 
 
@@ -80,32 +80,32 @@ def test_f4_conductivity_and_capacity_at_their_ends():
     """F4: an infinite conductivity and a capacity of zero are refused, no conductivity insulates, a cut link is cut though infinite."""
     net = js.lattice(4)
     with pytest.raises(ValueError, match=r"conductivity\[2\] = inf"):
-        js.conductances(net, [1.0, 1.0, np.inf, 1.0], 1.0)
+        js.thermal.conductances(net, [1.0, 1.0, np.inf, 1.0], 1.0)
     with pytest.raises(ValueError, match=r"conductance\[1\] = inf"):
         js.Heat(net, 1.0, [1.0, np.inf, 1.0])
     with pytest.raises(ValueError, match=r"capacity\[3\] = 0"):
         js.Heat(net, [1.0, 1.0, 1.0, 0.0], 1.0)
     t = np.array([1.0, 2.0, 5.0, 7.0])
-    insulated = js.Heat(net, 1.0, js.conductances(net, [1.0, 1.0, 0.0, 1.0], 1.0))
+    insulated = js.Heat(net, 1.0, js.thermal.conductances(net, [1.0, 1.0, 0.0, 1.0], 1.0))
     np.testing.assert_allclose(go(insulated, t, 0.1, 200)[0].state.temperature, [1.5, 1.5, 5.0, 7.0], atol=1e-6)
     endless = eqx.tree_at(lambda h: h.conductance, js.Heat(net, 1.0, np.ones(3), cut_by=net), jnp.array([1.0, jnp.inf, 1.0]))
-    alive = js.EdgeField(tuple(a > 0.5 for a in net.split(jnp.array([1.0, 0.0, 1.0])).families))
+    alive = js.topology.EdgeField(tuple(a > 0.5 for a in net.split(jnp.array([1.0, 0.0, 1.0])).families))
     start = dataclasses.replace(js.State.from_points(net, net.grid(), temperature=t), alive=alive)
     np.testing.assert_allclose(endless.power(start), [1.0, -1.0, 2.0, -2.0])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("latent", [None, js.LatentHeat(330.0, 0.4)], ids=["sensible", "latent"])
+@pytest.mark.parametrize("latent", [None, js.thermal.LatentHeat(330.0, 0.4)], ids=["sensible", "latent"])
 def test_f9_two_time_steps(latent, rng):
     """F9: 1,000 heat steps in one of the nodes, or one in 1,000: heat is kept to 1e-13, and what happens is what single steps do."""
     net = js.lattice((3, 4))
     t, dt = rng.uniform(300, 360, 12), 1e-5
-    single = body(net, js.ExplicitHeat(), latent=latent)
+    single = body(net, js.thermal.ExplicitHeat(), latent=latent)
     one_by_one, start = go(single, t, dt, 1000)
     start = single.begin(start)
-    within, _ = go(body(net, js.ExplicitHeat(), latent=latent, substeps=1000), t, 1000 * dt, 1)
+    within, _ = go(body(net, js.thermal.ExplicitHeat(), latent=latent, substeps=1000), t, 1000 * dt, 1)
     np.testing.assert_allclose(within.state.temperature, one_by_one.state.temperature, rtol=1e-13)
-    seldom, _ = go(body(net, js.ExplicitHeat(), latent=latent, every=1000), t, dt / 1000, 2000)
+    seldom, _ = go(body(net, js.thermal.ExplicitHeat(), latent=latent, every=1000), t, dt / 1000, 2000)
     np.testing.assert_allclose(seldom.state.temperature, go(single, t, dt, 2)[0].state.temperature, rtol=1e-13)
     for run in (one_by_one, within, seldom):
         assert int(run.status.flags) == 0

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 
 import jaxspring as js
-from jaxspring.forces.base import Rule
 from jaxspring.status import Status
 
 NET = js.lattice((4, 6), js.STRUCTURAL + js.SHEAR)
 
 
-class CutAt(Rule):
+class CutAt(js.Rule):
     """Breaks the springs across the middle at the end of one step, by the melting point: it heats them for that step."""
 
     step: jnp.ndarray
@@ -67,7 +66,7 @@ def heated_bar(power, sharpness):
     The smooth model cuts nothing: its springs only soften.
     """
     net = js.lattice(8)
-    springs = js.Springs(net, js.ThermalStiffness(40.0, 300.0, 340.0, sharpness), 1.0)
+    springs = js.Springs(net, js.thermal.ThermalStiffness(40.0, 300.0, 340.0, sharpness), 1.0)
     heat = js.Heat(net, 1.0, 0.05, source=jnp.asarray([0, 0, power, 0, 0, 0, 0, 0.0]))
     rules = (heat,) if sharpness is not None else (heat, js.Fusing(net, 340.0))
     free = np.arange(8) > 0

@@ -19,7 +19,7 @@ def found(system, state):
 
 def test_g1_zero_force_at_r0_and_the_force_is_the_potentials():
     """At r = 1.0916079783 the force is zero to 1e-15, and -dU/dr = F to 5e-15 at any distance."""
-    law = js.SlideLaw(1.0, 1.0, 0.1)
+    law = js.fluid.SlideLaw(1.0, 1.0, 0.1)
     r0 = float(law.equilibrium_distance)
     assert r0 == pytest.approx(1.0916079783, abs=5e-11)
     system, state = make(np.array([[0.0, 0.0], [r0, 0.0]]))
@@ -99,7 +99,7 @@ def test_g5_head_on(rng):
 )
 def test_g5_the_warning_names_the_limit_that_was_passed(dt, points, speed, text):
     """A dt above stable_dt is told with it; below it the warning speaks of the particles, and of no limit that dt keeps."""
-    options = {"law": js.LennardJones(1.0, 1.0), "cutoff": js.PlainCutoff(2.5), "pairs": js.NeighbourList(4, 0.3)}
+    options = {"law": js.fluid.LennardJones(1.0, 1.0), "cutoff": js.fluid.PlainCutoff(2.5), "pairs": js.fluid.NeighbourList(4, 0.3)}
     system, state = make(np.array(points), velocities=np.array([[speed, 0.0], [0.0, 0.0]]), **options)
     with pytest.warns(js.StabilityWarning, match=f"DT_LIMIT: .*{text}") as told:
         js.rollout(system, state, js.SymplecticEuler(), dt, 1)
@@ -109,7 +109,9 @@ def test_g5_the_warning_names_the_limit_that_was_passed(dt, points, speed, text)
 def test_g5_an_error_names_no_infinite_limit():
     """Where nothing limits dt, an error does not say that the limit was infinite."""
     fast = np.array([[1e307, 0.0], [0.0, 0.0]])
-    system, state = make(np.array([[0.0, 0.0], [9.0, 0.0]]), law=js.LennardJones(1.0, 1.0), cutoff=js.PlainCutoff(2.5), velocities=fast)
+    system, state = make(
+        np.array([[0.0, 0.0], [9.0, 0.0]]), law=js.fluid.LennardJones(1.0, 1.0), cutoff=js.fluid.PlainCutoff(2.5), velocities=fast
+    )
     result = jax.jit(lambda dt: js.rollout(system, state, js.SymplecticEuler(), dt, 1))(100.0)
     with pytest.raises(js.SimulationError) as told:
         js.raise_for_status(result)
@@ -127,7 +129,7 @@ def test_g6_what_a_cutoff_leaves_out(rng):
     whole = components(system.force(state))[0]
     errors = []
     for c in (2.0, 4.0, 8.0, 16.0):
-        cut, _ = make(points, cutoff=js.PlainCutoff(c))
+        cut, _ = make(points, cutoff=js.fluid.PlainCutoff(c))
         errors.append(np.linalg.norm(components(cut.force(state))[0] - whole) / np.linalg.norm(whole))
     assert errors[0] > 0.9
     assert errors[1] > 0.85
@@ -141,7 +143,7 @@ def test_g6_shifted_force_keeps_energy_better(rng):
     """Over 4,000 steps the shifted force drifts at most a third of what the plain cut-off does."""
     points, speeds = blob(rng, 27, spacing=1.2), rng.normal(0, 0.4, (27, 3))
     drift = {}
-    for cutoff in (js.PlainCutoff(2.5), js.ShiftedForce(2.5)):
+    for cutoff in (js.fluid.PlainCutoff(2.5), js.fluid.ShiftedForce(2.5)):
         system, state = make(points, velocities=speeds, cutoff=cutoff)
         # The plain force has a potential only up to jumps in force: its own, continuous one, is what must stay.
         saved = js.rollout(system, state, js.SymplecticEuler(), 5e-3, 4000, save_every=40).saved
@@ -156,8 +158,8 @@ def test_g7_a_list_too_small_says_what_it_needs(rng):
     points = blob(rng, 227, spacing=0.9)
     near = np.linalg.norm(points[:, None] - points[None], axis=-1) < 2.3
     needed = near.sum(axis=1).max() - 1
-    cut = js.ShiftedForce(2.0)
-    system, state = make(points, cutoff=cut, pairs=js.NeighbourList(capacity=32, skin=0.3))
+    cut = js.fluid.ShiftedForce(2.0)
+    system, state = make(points, cutoff=cut, pairs=js.fluid.NeighbourList(capacity=32, skin=0.3))
     assert needed > 32
     counted = found(system, system.bind(state.dtype).begin(state))[OVERFLOW]
     assert counted >= needed
@@ -170,7 +172,7 @@ def test_g7_a_list_too_small_says_what_it_needs(rng):
 @pytest.mark.slow
 def test_g7_an_overflow_ends_in_an_exception(rng):
     """A rollout whose list is too small ends with the flag and the capacity as its count, and raises."""
-    system, state = make(blob(rng, 100, spacing=0.8), cutoff=js.ShiftedForce(2.5), pairs=js.NeighbourList(capacity=8, skin=0.3))
+    system, state = make(blob(rng, 100, spacing=0.8), cutoff=js.fluid.ShiftedForce(2.5), pairs=js.fluid.NeighbourList(capacity=8, skin=0.3))
     result = js.rollout(system, state, js.SymplecticEuler(), 1e-4, 2)
     assert int(result.status.count) > 32
     with pytest.raises(js.SimulationError, match=f"NEIGHBOUR_OVERFLOW.*capacity.*count {int(result.status.count)}"):
@@ -182,8 +184,8 @@ def test_g7_an_overflow_ends_in_an_exception(rng):
 def test_g8_one_or_two_particles(n):
     """One particle feels nothing; two feel each other once, by list and by all pairs alike."""
     points = np.array([[0.3, 0.1], [1.3, 0.4]])[:n]
-    for pairs in (js.AllPairs(), js.NeighbourList(8, 0.3)):
-        system, state = make(points, cutoff=js.PlainCutoff(2.5), pairs=pairs)
+    for pairs in (js.fluid.AllPairs(), js.fluid.NeighbourList(8, 0.3)):
+        system, state = make(points, cutoff=js.fluid.PlainCutoff(2.5), pairs=pairs)
         np.testing.assert_allclose(components(system.force(state)), slide_force(points, np.ones(n)), atol=1e-15)
 
 
@@ -191,10 +193,10 @@ def test_g8_one_or_two_particles(n):
 def test_g8_cell_borders_and_the_cutoff_itself():
     """Particles on cell borders, below zero too, count once; a pair at exactly r_c has no force, one a hair nearer has."""
     grid = np.stack(np.meshgrid(*[np.arange(-3, 4)] * 2, indexing="ij"), axis=-1).reshape(-1, 2).astype(float)
-    system, state = make(grid, cutoff=js.PlainCutoff(1.5), pairs=js.NeighbourList(16, 0.5))
+    system, state = make(grid, cutoff=js.fluid.PlainCutoff(1.5), pairs=js.fluid.NeighbourList(16, 0.5))
     np.testing.assert_allclose(components(system.force(state)), slide_force(grid, np.ones(49), reach=1.5), atol=1e-13)
     for r, acts in ((2.0, False), (2.0 - 1e-12, True)):
-        pair, apart = make(np.array([[0.0, 0.0], [r, 0.0]]), cutoff=js.PlainCutoff(2.0), pairs=js.NeighbourList(8, 0.5))
+        pair, apart = make(np.array([[0.0, 0.0], [r, 0.0]]), cutoff=js.fluid.PlainCutoff(2.0), pairs=js.fluid.NeighbourList(8, 0.5))
         assert bool(pair.force(apart).x[0] != 0) == acts
 
 
@@ -204,8 +206,8 @@ def test_g10_list_equals_all_pairs(dim, dtype, rng):
     """At the same cut-off to 1e-12 in float64 and 1e-5 in float32, also far from the origin of the cells, energy included."""
     points = ((blob(rng, 300, dim, spacing=1.1) if dim > 1 else blob(rng, 40, 1, spacing=1.1)) - 7.3).astype(dtype)
     mass = rng.uniform(0.5, 2, len(points)).astype(dtype)
-    options = {"mass": mass, "cutoff": js.ShiftedForce(2.5)}
-    listed, state = make(points, pairs=js.NeighbourList(80, 0.3), **options)
+    options = {"mass": mass, "cutoff": js.fluid.ShiftedForce(2.5)}
+    listed, state = make(points, pairs=js.fluid.NeighbourList(80, 0.3), **options)
     everyone, _ = make(points, **options)
 
     @jax.jit
@@ -232,18 +234,18 @@ def test_g8_no_particle_at_all():
 
 
 TRACED = {
-    "epsilon": lambda bad: js.Fluid(js.LennardJones(bad, 1.0)),
-    "sigma": lambda bad: js.Fluid(js.LennardJones(1.0, bad)),
-    "alpha": lambda bad: js.Fluid(js.SlideLaw(bad, 1.0)),
-    "beta": lambda bad: js.Fluid(js.UnitVectorLaw(1.0, bad)),
-    "radius": lambda bad: js.Fluid(js.LennardJones(1.0, 1.0), js.PlainCutoff(bad)),
-    "on": lambda bad: js.Fluid(js.LennardJones(1.0, 1.0), js.Switched(bad, 2.5)),
-    "off": lambda bad: js.Fluid(js.LennardJones(1.0, 1.0), js.Switched(1.5, bad)),
-    "skin": lambda bad: js.Fluid(js.LennardJones(1.0, 1.0), js.PlainCutoff(2.5), js.NeighbourList(4, bad)),
-    "drag": lambda bad: js.Fluid(js.LennardJones(1.0, 1.0), drag=js.PairDrag(bad, 1.5)),
-    "drag.radius": lambda bad: js.Fluid(js.LennardJones(1.0, 1.0), drag=js.PairDrag(1.0, bad)),
-    "core": lambda bad: js.Fluid(js.LennardJones(1.0, 1.0), core=bad),
-    "zeta": lambda bad: js.Fluid(js.SlideLaw(1.0, 1.0, bad)),
+    "epsilon": lambda bad: js.Fluid(js.fluid.LennardJones(bad, 1.0)),
+    "sigma": lambda bad: js.Fluid(js.fluid.LennardJones(1.0, bad)),
+    "alpha": lambda bad: js.Fluid(js.fluid.SlideLaw(bad, 1.0)),
+    "beta": lambda bad: js.Fluid(js.fluid.UnitVectorLaw(1.0, bad)),
+    "radius": lambda bad: js.Fluid(js.fluid.LennardJones(1.0, 1.0), js.fluid.PlainCutoff(bad)),
+    "on": lambda bad: js.Fluid(js.fluid.LennardJones(1.0, 1.0), js.fluid.Switched(bad, 2.5)),
+    "off": lambda bad: js.Fluid(js.fluid.LennardJones(1.0, 1.0), js.fluid.Switched(1.5, bad)),
+    "skin": lambda bad: js.Fluid(js.fluid.LennardJones(1.0, 1.0), js.fluid.PlainCutoff(2.5), js.fluid.NeighbourList(4, bad)),
+    "drag": lambda bad: js.Fluid(js.fluid.LennardJones(1.0, 1.0), drag=js.fluid.PairDrag(bad, 1.5)),
+    "drag.radius": lambda bad: js.Fluid(js.fluid.LennardJones(1.0, 1.0), drag=js.fluid.PairDrag(1.0, bad)),
+    "core": lambda bad: js.Fluid(js.fluid.LennardJones(1.0, 1.0), core=bad),
+    "zeta": lambda bad: js.Fluid(js.fluid.SlideLaw(1.0, 1.0, bad)),
 }
 MAY_BE_ZERO = ("drag", "zeta")
 
@@ -277,11 +279,11 @@ def test_g9_traced_constants_of_the_wrong_sign(name):
 
 def test_g9_traced_distances_beyond_the_reach():
     """A cut-off below r_0, the core or the list's drag, and a switch that ends before it begins, are INVALID; one at r_0 is none."""
-    lj, r_0 = js.LennardJones(1.0, 1.0), 2 ** (1 / 6)
-    assert is_refused(lambda c: js.Fluid(lj, js.PlainCutoff(c)), 0.5)
-    assert not is_refused(lambda c: js.Fluid(lj, js.PlainCutoff(c)), r_0)
-    assert not is_refused(lambda c: js.Fluid(lj, js.PlainCutoff(c)), np.float32(r_0))
-    assert is_refused(lambda c: js.Fluid(lj, js.PlainCutoff(2.5), core=c), 2.6)
-    assert is_refused(lambda c: js.Fluid(lj, js.Switched(c, 2.5)), 2.6)
-    assert is_refused(lambda c: js.Fluid(lj, js.PlainCutoff(2.5), js.NeighbourList(4, 0.3), js.PairDrag(1.0, c)), 2.6)
-    assert not is_refused(lambda c: js.Fluid(lj, js.PlainCutoff(2.5), drag=js.PairDrag(1.0, c)), 2.6)
+    lj, r_0 = js.fluid.LennardJones(1.0, 1.0), 2 ** (1 / 6)
+    assert is_refused(lambda c: js.Fluid(lj, js.fluid.PlainCutoff(c)), 0.5)
+    assert not is_refused(lambda c: js.Fluid(lj, js.fluid.PlainCutoff(c)), r_0)
+    assert not is_refused(lambda c: js.Fluid(lj, js.fluid.PlainCutoff(c)), np.float32(r_0))
+    assert is_refused(lambda c: js.Fluid(lj, js.fluid.PlainCutoff(2.5), core=c), 2.6)
+    assert is_refused(lambda c: js.Fluid(lj, js.fluid.Switched(c, 2.5)), 2.6)
+    assert is_refused(lambda c: js.Fluid(lj, js.fluid.PlainCutoff(2.5), js.fluid.NeighbourList(4, 0.3), js.fluid.PairDrag(1.0, c)), 2.6)
+    assert not is_refused(lambda c: js.Fluid(lj, js.fluid.PlainCutoff(2.5), drag=js.fluid.PairDrag(1.0, c)), 2.6)

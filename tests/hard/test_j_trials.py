@@ -10,7 +10,7 @@ from jaxspring.status import Flag
 from tests.reference import central_difference, relative_error, spring_forces
 
 STEPPERS = [js.ForwardEuler(), js.SymplecticEuler(), js.VelocityVerlet(), js.RungeKutta4()]
-BOTH_WAYS = pytest.mark.parametrize("reduction", [js.Gather, js.Scatter])
+BOTH_WAYS = pytest.mark.parametrize("reduction", [js.topology.Gather, js.topology.Scatter])
 
 
 @pytest.mark.parametrize("stepper", STEPPERS, ids=repr)
@@ -68,7 +68,9 @@ def test_j3_a_star(rng, reduction):
     assert large[2] <= 10.2 * small[2]
 
 
-@pytest.mark.parametrize("field", [js.Vector((jnp.ones(2), jnp.zeros(2))), js.EdgeField((jnp.ones(2),))], ids=["vector", "edge field"])
+@pytest.mark.parametrize(
+    "field", [js.Vector((jnp.ones(2), jnp.zeros(2))), js.topology.EdgeField((jnp.ones(2),))], ids=["vector", "edge field"]
+)
 def test_j4_numpy_on_the_left(field):
     """A NumPy number or array with a field gives a field or a TypeError, never an object array."""
     two = np.float32(2)
@@ -104,7 +106,7 @@ def test_j5_stiffness_in_the_users_order(rng, reduction):
     expected = 0.5 * (np.linalg.norm(points[edges[:, 1]] - points[edges[:, 0]], axis=1) - 0.9) ** 2
     np.testing.assert_allclose(jax.jit(jax.grad(energy))(k), expected, rtol=1e-12)
     np.testing.assert_allclose(jax.jit(jax.vmap(jax.grad(energy)))(jnp.stack([k, 2 * k])), [expected, expected], rtol=1e-12)
-    if reduction is js.Gather:
+    if reduction is js.topology.Gather:
         for program in (jax.jit(jax.grad(energy)).lower(k), jax.jit(jax.vmap(jax.grad(energy))).lower(jnp.stack([k, k]))):
             assert "scatter" not in program.as_text()
 

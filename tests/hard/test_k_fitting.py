@@ -133,7 +133,7 @@ def test_parameters_without_influence_and_too_few_residuals():
         a, b, c = p["abc"]
         return jnp.stack([a + b - 3.0, 2.0 * c - 1.0]) + 0.0 * p["idle"]
 
-    with pytest.warns(js.GradientWarning, match="idle"):
+    with pytest.warns(js.inverse.GradientWarning, match="idle"):
         found = js.fit(residuals, {"abc": jnp.ones(3), "idle": jnp.asarray(7.0)}, js.LeastSquares(), 60)
     assert found.undetermined.count == 2
     assert found.undetermined.names == ("abc[0]", "abc[1]", "idle")
@@ -178,7 +178,7 @@ def test_gradients_that_are_always_zero_are_named():
     found = js.fit(lambda p: jnp.sum(p["k"][:2] ** 2), {"k": jnp.ones(4)}, js.Adam(0.1), 3)
     assert found.undetermined.names == ("k[2]", "k[3]")
     assert bool(found.status.has(js.Flag.UNDETERMINED))
-    with pytest.warns(js.GradientWarning):
+    with pytest.warns(js.inverse.GradientWarning):
         assert js.fit(bowl, {"a": jnp.full(2, 3.0), "b": jnp.ones(1)}, js.Adam(0.1), 2).undetermined is None
 
 

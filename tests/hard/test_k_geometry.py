@@ -58,8 +58,8 @@ def scattered(rng, box, spacing=1.1):
         (lambda: js.State.from_points(free_net(2, [5.0]), np.zeros((2, 2))), "box has 1 periods, but positions have 2"),
         (lambda: js.Springs(js.lattice(5, periodic=True, box=[5.0]), 1.0, 2.6), r"rest_length = 2\.6 m.*more than 2\.5 m"),
         (lambda: js.Springs(js.Graph.from_edges([(0, 1)] * 2, 2, box=[3.0, 4.0]), 1.0, [1.0, 2.6]), r"rest_length\[1\] = 2\.6 m"),
-        (lambda: fluid(free_net(2, [5.0, 0.0]), js.PlainCutoff(2.6)), r"cut-off = 2\.6 m is beyond half.*at most 2\.5 m"),
-        (lambda: fluid(free_net(2, [6.0]), js.PlainCutoff(2.5), drag=js.PairDrag(1.0, 3.1)), r"drag\.radius = 3\.1"),
+        (lambda: fluid(free_net(2, [5.0, 0.0]), js.fluid.PlainCutoff(2.6)), r"cut-off = 2\.6 m is beyond half.*at most 2\.5 m"),
+        (lambda: fluid(free_net(2, [6.0]), js.fluid.PlainCutoff(2.5), drag=js.fluid.PairDrag(1.0, 3.1)), r"drag\.radius = 3\.1"),
     ],
 )
 def test_a_wrong_box_is_refused_by_name(make, message):
@@ -70,14 +70,14 @@ def test_a_wrong_box_is_refused_by_name(make, message):
 
 def fluid(net, cutoff=None, **options):
     """A Lennard-Jones fluid of 1 J and 1 m."""
-    return js.System(net, 1.0, js.Fluid(js.LennardJones(1.0, 1.0), cutoff=cutoff, **options))
+    return js.System(net, 1.0, js.Fluid(js.fluid.LennardJones(1.0, 1.0), cutoff=cutoff, **options))
 
 
 @pytest.mark.parametrize("box", [[5.0, 0.0], [6.0, 7.0, 8.0]])
 def test_what_a_box_allows(box):
     """A coordinate without period, rest lengths along a diagonal, cut-offs of exactly half a period, and rings that close in space."""
     net = free_net(2, box)
-    fluid(net, js.PlainCutoff(min(b for b in box if b) / 2))
+    fluid(net, js.fluid.PlainCutoff(min(b for b in box if b) / 2))
     js.Springs(js.Graph.from_edges([(0, 1)], 2, box=box), 1.0, 0.49 * np.linalg.norm(box))
     ring = js.lattice(6, periodic=True, box=[0.0] * len(box))
     angle = np.arange(6) * np.pi / 3
@@ -146,7 +146,7 @@ def test_a_box_that_was_traced_is_told():
     def flags(box):
         net = free_net(2, box[None])
         state = js.State.from_points(net, [[0.3], [4.0]])
-        return js.rollout(fluid(net, js.PlainCutoff(2.5)), state, js.VelocityVerlet(), 1e-4, 1).status.flags
+        return js.rollout(fluid(net, js.fluid.PlainCutoff(2.5)), state, js.VelocityVerlet(), 1e-4, 1).status.flags
 
     found = jax.vmap(flags)(jnp.array([12.0, 4.5, -12.0]))
     assert [int(flag) & int(js.Flag.BOX) > 0 for flag in found] == [False, True, True]
@@ -183,11 +183,11 @@ def test_a_fluid_in_a_box_is_the_sum_over_nearest_images(box, n_gradients, rng):
     box = np.array(box)
     points = scattered(rng, box)
     force, energy = lennard_jones(points, box, reach=2.5)
-    for i, pairs in enumerate((js.AllPairs(), js.NeighbourList(40, 0.3))):
+    for i, pairs in enumerate((js.fluid.AllPairs(), js.fluid.NeighbourList(40, 0.3))):
 
         def energy_of(points, periods, pairs=pairs):
             net = free_net(len(points), periods)
-            system = fluid(net, js.PlainCutoff(2.5), pairs=pairs)
+            system = fluid(net, js.fluid.PlainCutoff(2.5), pairs=pairs)
             state = js.State.from_points(net, points)
             return system.energy(state).potential[0], system.force(state)
 
@@ -211,8 +211,8 @@ def test_a_hot_fluid_crosses_the_walls(rng):
     speeds -= speeds.mean(axis=0)
     net = free_net(len(points), box)
     ends = []
-    for pairs in (js.AllPairs(), js.NeighbourList(64, 0.4)):
-        system = fluid(net, js.ShiftedForce(2.5), pairs=pairs)
+    for pairs in (js.fluid.AllPairs(), js.fluid.NeighbourList(64, 0.4)):
+        system = fluid(net, js.fluid.ShiftedForce(2.5), pairs=pairs)
         state = js.State.from_points(net, points, speeds)
         result = js.rollout(system, state, js.VelocityVerlet(), 2e-3, 300)
         assert int(result.status.flags) == 0
@@ -228,12 +228,12 @@ def test_a_hot_fluid_crosses_the_walls(rng):
 @pytest.mark.slow
 def test_drag_and_overlap_through_the_wall():
     """Drag of a pair acts through the wall as inside the box, and two particles at one image are an OVERLAP."""
-    drag = js.PairDrag(2.0, 1.5)
+    drag = js.fluid.PairDrag(2.0, 1.5)
     forces = []
     for points, box in (([[0.1, 1.0], [9.9, 1.4]], [10.0, 10.0]), ([[0.1, 1.0], [-0.1, 1.4]], [0.0, 0.0])):
         net = free_net(2, box)
         state = js.State.from_points(net, points, [[1.0, 0.0], [-1.0, 2.0]])
-        forces.append(components(fluid(net, js.PlainCutoff(2.5), drag=drag, pairs=js.NeighbourList(4, 0.3)).force(state)))
+        forces.append(components(fluid(net, js.fluid.PlainCutoff(2.5), drag=drag, pairs=js.fluid.NeighbourList(4, 0.3)).force(state)))
     np.testing.assert_allclose(forces[0], forces[1], rtol=1e-11)
     net = free_net(2, [10.0])
     result = js.rollout(fluid(net), js.State.from_points(net, [[1e-4], [10.0]]), js.VelocityVerlet(), 0.0, 1)

@@ -23,6 +23,7 @@ from jaxspring.memory import Memory, Owner
 from jaxspring.resume import Origin
 from jaxspring.rollouts import Info
 from jaxspring.thermal.ledger import Account
+from tests import face
 
 # A triangle whose last spring is broken, and the same without it.
 WHOLE = js.Graph.from_edges([(0, 1), (1, 2), (0, 2)], 3)
@@ -54,7 +55,7 @@ def pull_of_one(r, k, l):
 
 
 def thermal(net, k, l):
-    return js.Springs(net, js.ThermalStiffness(k, 300.0, 400.0), l, expansion=js.ThermalExpansion(1e-3, 300.0))
+    return js.Springs(net, js.thermal.ThermalStiffness(k, 300.0, 400.0), l, expansion=js.thermal.ThermalExpansion(1e-3, 300.0))
 
 
 EFFECTS = {
@@ -83,7 +84,7 @@ def answers(net, make, alive, k, l, x):
         system = js.System(net, 1.0, make(net, k, l))
         f = system.force(state)
         v = js.Vector(tuple(net.node_field(jnp.asarray(SPEEDS[:, i])) for i in range(2)))
-        blocks = system.stiffness_blocks(state, js.ExactTangent()) + system.damping_blocks(state)
+        blocks = system.stiffness_blocks(state, js.steppers.ExactTangent()) + system.damping_blocks(state)
         kv = system.matrix(blocks, state)(v)
         flat = jnp.stack([net.flatten_nodes(a) for a in (*f, *kv)])
         energy = system.energy(state).potential[0]
@@ -201,7 +202,7 @@ def test_k8_two_nets_cannot_both_fuse():
 
 def test_k8_a_field_made_by_hand_is_of_the_systems_net():
     """An `alive` that does not say whose springs it tells about is that of the system's net, and of no other net with as many springs."""
-    bare = js.EdgeField((jnp.array([True, False, True]),))
+    bare = js.topology.EdgeField((jnp.array([True, False, True]),))
     own, others = js.Springs(ONE, 10.0, 1.0), js.Springs(OTHER, 20.0, 1.0)
     state = js.State.from_points(ONE, LINE)
     force = js.System(ONE, 1.0, (own, others)).force(dataclasses.replace(state, alive=bare))
@@ -219,8 +220,10 @@ REFUSALS = {
     "cut by what is alive": lambda: js.Heat(ONE, 1.0, 1.0, cut_by=ONE).power(
         dataclasses.replace(js.State.from_points(ONE, LINE, temperature=HOT), alive=OTHER.split(jnp.ones(3, bool)))
     ),
-    "melted": lambda: js.melted_fraction(ONE, dataclasses.replace(js.State.from_points(ONE, LINE), alive=OTHER.split(jnp.ones(3, bool)))),
-    "boundary": lambda: js.Heat(ONE, 1.0, 1.0, boundaries=js.FixedTemperature(TURNED, np.arange(4) == 0, 300.0)),
+    "melted": lambda: js.thermal.melted_fraction(
+        ONE, dataclasses.replace(js.State.from_points(ONE, LINE), alive=OTHER.split(jnp.ones(3, bool)))
+    ),
+    "boundary": lambda: js.Heat(ONE, 1.0, 1.0, boundaries=js.thermal.FixedTemperature(TURNED, np.arange(4) == 0, 300.0)),
     "skyline": lambda: js.Skyline(ONE).init(matrix_on(OTHER)),
 }
 # Joined otherwise, so that its nodes have another order inside.
@@ -230,7 +233,7 @@ TURNED = js.Graph.from_edges([(0, 3), (3, 1), (1, 2)], 4)
 def matrix_on(net):
     system = js.System(net, 1.0, js.Springs(net, 10.0, 1.0))
     state = js.State.from_points(net, LINE)
-    return system.matrix(system.stiffness_blocks(state, js.Tangent()), state)
+    return system.matrix(system.stiffness_blocks(state, js.steppers.Tangent()), state)
 
 
 @pytest.mark.parametrize("act", REFUSALS.values(), ids=REFUSALS.keys())
@@ -356,7 +359,7 @@ def test_k9_right_or_reported_from_1e_minus_30_to_1e30(law, pull, energy):
     def found(k, l, x, y):
         d = js.Vector((x, y))
         value = spring_energy(law, d, k, l) if energy is not None else jnp.zeros_like(k)
-        weight, slope, _ = spring_block(law, js.ExactTangent(), d, k, l)
+        weight, slope, _ = spring_block(law, js.steppers.ExactTangent(), d, k, l)
         return spring_pull(law, d, k, l)[0] / 0.6, value, weight, weight + slope, has_no_direction(d), is_beyond_range(d)
 
     got_pull, got_energy, weight, along, near, far = (np.asarray(a) for a in found(*single))
@@ -465,30 +468,85 @@ def instances():
     heat, fusing = js.Heat(TWO, 1.0, 1.0), js.Fusing(TWO, 350.0)
     system = js.System(TWO, 1.0, springs, rules=(heat, fusing))
     number, whole, status = jnp.array(1.5), jnp.array(3), js.Status.ok()
-    info = js.SolveInfo(number, whole, status)
-    matrix = system.matrix(system.stiffness_blocks(state, js.Tangent()) + js.Blocks((js.Vector((jnp.ones(2),)),)), state)
+    info = js.linalg.SolveInfo(number, whole, status)
+    matrix = system.matrix(system.stiffness_blocks(state, js.steppers.Tangent()) + js.linalg.Blocks((js.Vector((jnp.ones(2),)),)), state)
     direct = js.Skyline(TWO)
     resume = js.Resume(number, whole, whole, number, number, None, whole, whole, Origin.of(system, state, js.SymplecticEuler()))
     ode = js.OdeInfo(whole, whole, whole, None, None)
     fit = js.Fit(
-        {"k": number}, {"k": number}, 1.0, 3, js.History(*np.ones((3, 2))), None, None, None, status, js.StopReason.ITERATIONS, None, ""
+        {"k": number},
+        {"k": number},
+        1.0,
+        3,
+        js.inverse.History(*np.ones((3, 2))),
+        None,
+        None,
+        None,
+        status,
+        js.inverse.StopReason.ITERATIONS,
+        None,
+        "",
     )
-    pixels = js.PixelSprings(None, 1.0)
+    pixels = js.reconstruction.PixelSprings(None, 1.0)
     classes = [
         js.Account(number, number, number, number, number, number),
-        *(js.Adam(), js.LBFGS(), js.LeastSquares(), js.Optax(optax.identity()), js.Stop()),
-        *(js.AllPairs(), js.NeighbourList(8, 0.1), js.PairDrag(1.0, 1.0), js.NoCutoff(), js.PlainCutoff(2.0), js.ShiftedForce(2.0)),
-        *(js.Switched(1.0, 2.0), js.SlideLaw(1.0, 1.0), js.UnitVectorLaw(1.0, 1.0), js.LennardJones(1.0, 1.0)),
-        js.Fluid(js.LennardJones(1.0, 1.0)),
+        *(js.Adam(), js.LBFGS(), js.LeastSquares(), js.inverse.Optax(optax.identity()), js.Stop()),
+        *(
+            js.fluid.AllPairs(),
+            js.fluid.NeighbourList(8, 0.1),
+            js.fluid.PairDrag(1.0, 1.0),
+            js.fluid.NoCutoff(),
+            js.fluid.PlainCutoff(2.0),
+            js.fluid.ShiftedForce(2.0),
+        ),
+        *(js.fluid.Switched(1.0, 2.0), js.fluid.SlideLaw(1.0, 1.0), js.fluid.UnitVectorLaw(1.0, 1.0), js.fluid.LennardJones(1.0, 1.0)),
+        js.Fluid(js.fluid.LennardJones(1.0, 1.0)),
         *(js.BDF2(), js.BackwardEuler(direct), js.ImplicitMidpoint(newton=True), js.SemiImplicit(), js.Newton(), js.Still()),
         *(js.ForwardEuler(), js.RungeKutta4(), js.SymplecticEuler(), js.VelocityVerlet()),
-        *(js.BackwardEulerHeat(), js.CrankNicolsonHeat(), js.ExplicitHeat(), js.SplitHeat(), js.SymmetricSplitHeat(), js.HeatIteration()),
-        *(js.Bilinear(), js.CubicSpline(), js.Curvature(), js.GradientMagnitude(), js.Intensity(), js.Channel(0), js.Luminance()),
-        js.Combined([js.Intensity(), js.Curvature()], [1.0, 2.0]),
-        *(js.BlockJacobi(), js.Jacobi(), js.Unpreconditioned(), js.Multigrid(TWO), js.CG(), js.JaxCG(), js.ExactSolver()),
-        *(js.Lineax(lineax.CG(1e-6, 1e-6)), direct, direct.factor(matrix), direct.profile(), js.Natural(), js.ReverseCuthillMcKee(), info),
-        *(matrix, matrix.blocks, matrix.blocks.springs[0], js.NodeDyads(number, js.Vector((number,)))),
-        *(js.Bounded(0.0, 1.0), js.Identity(), js.Positive(), js.SoftPositive(), js.Selection((number, whole), first)),
+        *(
+            js.thermal.BackwardEulerHeat(),
+            js.thermal.CrankNicolsonHeat(),
+            js.thermal.ExplicitHeat(),
+            js.thermal.SplitHeat(),
+            js.thermal.SymmetricSplitHeat(),
+            js.thermal.HeatIteration(),
+        ),
+        *(
+            js.images.Bilinear(),
+            js.images.CubicSpline(),
+            js.images.Curvature(),
+            js.images.GradientMagnitude(),
+            js.images.Intensity(),
+            js.images.Channel(0),
+            js.images.Luminance(),
+        ),
+        js.images.Combined([js.images.Intensity(), js.images.Curvature()], [1.0, 2.0]),
+        *(
+            js.linalg.BlockJacobi(),
+            js.linalg.Jacobi(),
+            js.linalg.Unpreconditioned(),
+            js.linalg.Multigrid(TWO),
+            js.CG(),
+            js.JaxCG(),
+            js.linalg.ExactSolver(),
+        ),
+        *(
+            js.linalg.Lineax(lineax.CG(1e-6, 1e-6)),
+            direct,
+            direct.factor(matrix),
+            direct.profile(),
+            js.linalg.Natural(),
+            js.linalg.ReverseCuthillMcKee(),
+            info,
+        ),
+        *(matrix, matrix.blocks, matrix.blocks.springs[0], js.linalg.NodeDyads(number, js.Vector((number,)))),
+        *(
+            js.Bounded(0.0, 1.0),
+            js.inverse.Identity(),
+            js.Positive(),
+            js.inverse.SoftPositive(),
+            js.inverse.Selection((number, whole), first),
+        ),
         *(js.Checkpoint("a.npz"), js.Checkpointed(), js.StoreAll(), js.StoreStates(), js.Progress(callback=tell)),
         *(js.ConstantsSettings(), js.SpringSettings(), js.Relaxation(), js.Reconstruction(image, (3, 3)), pixels),
         js.Reconstructed(*[None] * len(dataclasses.fields(js.Reconstructed))),
@@ -508,8 +566,13 @@ def instances():
         *(js.Equilibrium(state, info, whole, status, ("Springs",)), js.Solves(whole, number, status, info)),
         *(ode, js.OdeResult(state, None, number, status, ode, None, ("Springs",)), resume),
         js.Result(state, None, status, Info(None, whole), resume, ("Springs",)),
-        *(fit, fit.history, js.Iteration(1, 1.0, 1.0, 1.0, True, None, None, None, {"k": number}), js.GradientCheck((), 1.0, status)),
-        js.Undetermined(1, {"k": whole}, None, ("k",)),
+        *(
+            fit,
+            fit.history,
+            js.inverse.Iteration(1, 1.0, 1.0, 1.0, True, None, None, None, {"k": number}),
+            js.inverse.GradientCheck((), 1.0, status),
+        ),
+        js.inverse.Undetermined(1, {"k": whole}, None, ("k",)),
     ]
     return {type(a).__name__: a for a in classes}
 
@@ -519,7 +582,7 @@ INSTANCES = instances()
 
 def test_k6_the_table_has_every_public_class():
     """A public class that can be made and is missing in the table fails here."""
-    classes = {name: getattr(js, name) for name in js.__all__}
+    classes = face.public()
     wanted = {n for n, c in classes.items() if inspect.isclass(c) and not inspect.isabstract(c) and not issubclass(c, Exception)}
     bases = {n for n in wanted if any(classes[n] in type(a).__mro__[1:] for a in INSTANCES.values())}
     assert not wanted - set(INSTANCES) - bases
@@ -561,7 +624,7 @@ def test_k6_a_direct_solver_serves_after_pickling(net):
     points = np.random.default_rng(0).normal(size=(net.n_nodes, 2))
     system = js.System(net, 1.0, js.Springs(net, 10.0, 1.0))
     state = js.State.from_points(net, points)
-    blocks = js.Blocks((state.position.map(jnp.ones_like),)) + system.stiffness_blocks(state, js.Tangent())
+    blocks = js.linalg.Blocks((state.position.map(jnp.ones_like),)) + system.stiffness_blocks(state, js.steppers.Tangent())
     matrix, solver = system.matrix(blocks, state), js.Skyline(net)
     right = solver.factor(matrix).solve(state.position)
     named = eqx.tree_at(lambda m: m.blocks.springs[0].net, matrix, net.named("a"))

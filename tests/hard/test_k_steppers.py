@@ -53,7 +53,7 @@ def test_k3_a_moved_node_costs_no_order(stepper, order, shaken):
     assert np.log2(error(n) / error(2 * n)) == pytest.approx(order, abs=0.2)
 
 
-SOLVERS = [js.JaxCG(), js.CG(), js.JaxCG(preconditioner=js.Unpreconditioned())]
+SOLVERS = [js.JaxCG(), js.CG(), js.JaxCG(preconditioner=js.linalg.Unpreconditioned())]
 
 
 @pytest.mark.slow
@@ -87,7 +87,9 @@ def test_k4_one_number_is_solved_for(is_jitted):
             break
 
 
-@pytest.mark.parametrize("scheme", [js.ExplicitHeat(), js.BackwardEulerHeat(), js.CrankNicolsonHeat()], ids=lambda s: type(s).__name__)
+@pytest.mark.parametrize(
+    "scheme", [js.thermal.ExplicitHeat(), js.thermal.BackwardEulerHeat(), js.thermal.CrankNicolsonHeat()], ids=lambda s: type(s).__name__
+)
 def test_k4_one_node_is_heated(scheme):
     """6 W into 3 J/K for 0.5 s: one kelvin, by every scheme."""
     net = js.Graph.from_edges(np.zeros((0, 2), int), 1)

@@ -100,7 +100,9 @@ def test_k9_a_fluid_in_a_box_is_watched_inside_jit():
     """Energies and limits of a fluid in a box are the same under jit as outside, where the system is a constant of the program."""
     net = js.Graph.from_edges(np.zeros((0, 2), int), 2, box=(5.0, 5.0, 5.0))
     state = js.State.from_points(net, [[0.0, 0.0, 0.0], [4.0, 0.0, 0.0]])
-    system = js.System(net, 1.0, js.Fluid(js.LennardJones(1.0, 1.0), cutoff=js.ShiftedForce(2.0), drag=js.PairDrag(0.1, 1.5)))
+    system = js.System(
+        net, 1.0, js.Fluid(js.fluid.LennardJones(1.0, 1.0), cutoff=js.fluid.ShiftedForce(2.0), drag=js.fluid.PairDrag(0.1, 1.5))
+    )
     expected = float(system.energy(state).total)
     assert float(jax.jit(lambda s: system.energy(s).total)(state)) == pytest.approx(expected, abs=1e-12)
     run = js.rollout(system, state, js.VelocityVerlet(), 1e-3, 2, save_every=1, observe=lambda s: system.energy(s).total)

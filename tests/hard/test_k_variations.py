@@ -94,15 +94,15 @@ def over_an_image(d: Drawn, net):
 
 def heated(d: Drawn, net):
     """Springs that conduct, expand, soften and fuse."""
-    stiffness = js.ThermalStiffness(d.dtype(30.0), 300.0, 330.0)
-    springs = js.Springs(net, stiffness, at_rest(d), expansion=js.ThermalExpansion(2e-3, 300.0))
+    stiffness = js.thermal.ThermalStiffness(d.dtype(30.0), 300.0, 330.0)
+    springs = js.Springs(net, stiffness, at_rest(d), expansion=js.thermal.ThermalExpansion(2e-3, 300.0))
     heat = js.Heat(net, d.cast(1 + d.mass), d.cast(0.5 + d.per_spring))
     return js.System(net, d.cast(d.mass), (springs, js.Drag(0.3)), rules=(heat, js.Fusing(net, 328.0)))
 
 
 def fluid(d: Drawn, net):
     """Springs beside a particle fluid with a neighbour list."""
-    law = js.Fluid(js.LennardJones(0.05, 0.8), cutoff=js.ShiftedForce(1.6), pairs=js.NeighbourList(capacity=24, skin=0.5))
+    law = js.Fluid(js.fluid.LennardJones(0.05, 0.8), cutoff=js.fluid.ShiftedForce(1.6), pairs=js.fluid.NeighbourList(capacity=24, skin=0.5))
     return js.System(net, d.cast(d.mass), (js.Springs(net, d.cast(5 + 5 * d.per_spring), at_rest(d)), law))
 
 

@@ -9,11 +9,10 @@ import pytest
 import scipy.optimize
 
 import jaxspring as js
-from jaxspring.forces.base import Step
 from tests.particles import blob, components, make, slide_force
 
-LAWS = [js.SlideLaw(1.0, 1.3, 0.1), js.UnitVectorLaw(1.0, 1.3, 0.1), js.LennardJones(0.7, 0.9)]
-CUTOFFS = [js.NoCutoff(), js.PlainCutoff(2.3), js.ShiftedForce(2.3), js.Switched(1.6, 2.3)]
+LAWS = [js.fluid.SlideLaw(1.0, 1.3, 0.1), js.fluid.UnitVectorLaw(1.0, 1.3, 0.1), js.fluid.LennardJones(0.7, 0.9)]
+CUTOFFS = [js.fluid.NoCutoff(), js.fluid.PlainCutoff(2.3), js.fluid.ShiftedForce(2.3), js.fluid.Switched(1.6, 2.3)]
 by_name = {"ids": lambda option: type(option).__name__}
 
 
@@ -30,14 +29,14 @@ by_name = {"ids": lambda option: type(option).__name__}
 )
 def test_rest_and_frequency_of_a_pair(zeta, distance, stiffness, frequency):
     """r_0 = (s + sqrt(s^2 + 4 s zeta)) / 2 and k_0 = r_0 (4 beta / r_0^5 - 2 alpha / (r_0 + zeta)^3), to the last digit."""
-    law = js.SlideLaw(1.0, 1.0, zeta)
+    law = js.fluid.SlideLaw(1.0, 1.0, zeta)
     assert float(law.equilibrium_distance) == pytest.approx(distance, abs=1e-6)
     assert float(law.contact_stiffness) == pytest.approx(stiffness, abs=6e-6)
     assert float(jnp.sqrt(2 * law.contact_stiffness)) == pytest.approx(frequency, abs=6e-6)
 
 
 @pytest.mark.parametrize("exponents", [(1, 3), (1, 4), (2, 5), (3, 5)])
-@pytest.mark.parametrize("kind", [js.SlideLaw, js.UnitVectorLaw])
+@pytest.mark.parametrize("kind", [js.fluid.SlideLaw, js.fluid.UnitVectorLaw])
 def test_other_exponents(kind, exponents):
     """For all exponents the force is zero at the equilibrium distance and minus the derivative of the potential everywhere."""
     law = kind(1.0, 2.0, 0.3, *exponents)
@@ -50,9 +49,9 @@ def test_other_exponents(kind, exponents):
 
 def test_the_equilibrium_distance_can_be_differentiated():
     """With zeta = 0, r_0 = (beta / alpha)^(1/(b-a)); else Newton's method finds r_0, and beta (r + zeta)^2 = alpha r^5 holds along it."""
-    slope = jax.grad(lambda zeta, beta: js.SlideLaw(1.0, beta, zeta, a=2, b=5).equilibrium_distance, argnums=(0, 1))
+    slope = jax.grad(lambda zeta, beta: js.fluid.SlideLaw(1.0, beta, zeta, a=2, b=5).equilibrium_distance, argnums=(0, 1))
     assert float(slope(0.0, 2.0)[1]) == pytest.approx(2.0 ** (1 / 3 - 1) / 3, rel=1e-12)
-    r = float(js.SlideLaw(1.0, 2.0, 0.3, a=2, b=5).equilibrium_distance)
+    r = float(js.fluid.SlideLaw(1.0, 2.0, 0.3, a=2, b=5).equilibrium_distance)
     assert 2 * (r + 0.3) ** 2 == pytest.approx(r**5, rel=1e-12)
     stiff = 5 * r**4 - 4 * (r + 0.3)
     np.testing.assert_allclose(slope(0.3, 2.0), [4 * (r + 0.3) / stiff, (r + 0.3) ** 2 / stiff], rtol=1e-12)
@@ -67,28 +66,28 @@ def test_gentle_fluid_rests_at_the_spacing():
 
 def test_shifted_force_moves_the_pair_apart():
     """At c = 2.5 and alpha = beta = 1, zeta = 0 the pair rests at 1.35486 in a well of 0.03544 J; at c = 1.5 nothing attracts."""
-    law, cut = js.SlideLaw(1.0, 1.0), js.ShiftedForce(2.5)
+    law, cut = js.fluid.SlideLaw(1.0, 1.0), js.fluid.ShiftedForce(2.5)
     r = jnp.linspace(1.0, 2.5, 150_001)
     potential = cut.potential(law, r * r)
     assert float(r[jnp.argmin(potential)]) == pytest.approx(1.35486, abs=1e-5)
     assert float(-jnp.min(potential)) == pytest.approx(0.03544, abs=1e-5)
     near = jnp.linspace(0.5, 1.49, 100)
-    assert bool(jnp.all(js.ShiftedForce(1.5).weight(law, near * near) > 0))
+    assert bool(jnp.all(js.fluid.ShiftedForce(1.5).weight(law, near * near) > 0))
 
 
 def test_forces_as_printed(rng):
     """The sum over tiles equals the slides' formula, pair by pair in NumPy, masses and all."""
     points, mass = blob(rng, 40), rng.uniform(0.5, 2, 40)
     for tile in (None, 7):
-        system, state = make(points, mass, pairs=js.AllPairs(tile))
+        system, state = make(points, mass, pairs=js.fluid.AllPairs(tile))
         np.testing.assert_allclose(components(system.force(state)), slide_force(points, mass), rtol=1e-11, atol=1e-11)
 
 
 @pytest.mark.parametrize(
     ("law", "printed"),
     [
-        (js.UnitVectorLaw(1.0, 1.3, 0.1), lambda r, m: m * (-1 / (r + 0.1) ** 2 + 1.3 / r**4)),
-        (js.LennardJones(0.7, 0.9), lambda r, m: 24 * 0.7 / r * (2 * (0.9 / r) ** 12 - (0.9 / r) ** 6)),
+        (js.fluid.UnitVectorLaw(1.0, 1.3, 0.1), lambda r, m: m * (-1 / (r + 0.1) ** 2 + 1.3 / r**4)),
+        (js.fluid.LennardJones(0.7, 0.9), lambda r, m: 24 * 0.7 / r * (2 * (0.9 / r) ** 12 - (0.9 / r) ** 6)),
     ],
     **by_name,
 )
@@ -103,9 +102,9 @@ def test_other_laws_as_printed(law, printed, rng):
 @pytest.mark.parametrize(
     ("law", "repulsion"),
     [
-        (js.SlideLaw(1.0, 1.3, 0.1), lambda r: 1.3 / (2 * r**2)),
-        (js.UnitVectorLaw(1.0, 1.3, 0.1), lambda r: 1.3 / (3 * r**3)),
-        (js.LennardJones(0.7, 0.9), lambda r: 4 * 0.7 * (0.9 / r) ** 12),
+        (js.fluid.SlideLaw(1.0, 1.3, 0.1), lambda r: 1.3 / (2 * r**2)),
+        (js.fluid.UnitVectorLaw(1.0, 1.3, 0.1), lambda r: 1.3 / (3 * r**3)),
+        (js.fluid.LennardJones(0.7, 0.9), lambda r: 4 * 0.7 * (0.9 / r) ** 12),
     ],
     **by_name,
 )
@@ -118,16 +117,16 @@ def test_stiffness_where_two_particles_turn(law, repulsion):
         assert float(stiffness) == pytest.approx(float(curvature(at)), rel=1e-11)
 
 
-@pytest.mark.parametrize("law", [js.SlideLaw(1.0, 1.3, 0.1), js.LennardJones(0.7, 0.9)], **by_name)
+@pytest.mark.parametrize("law", [js.fluid.SlideLaw(1.0, 1.3, 0.1), js.fluid.LennardJones(0.7, 0.9)], **by_name)
 def test_step_for_a_collision(law):
     """Two of mass m at speed v turn where the pair has taken up m v^2; there they swing at sqrt(2 k / m). The worst particle is named."""
     mass, speed = np.array([1.0, 3.0, 0.5]), np.array([2.0, 4.0, 1.0])
     velocities = np.c_[np.zeros(3), speed]
     system, state = make(np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 3.0]]), mass, law, velocities)
-    charge = mass**2 if isinstance(law, js.SlideLaw) else np.ones(3)
+    charge = mass**2 if isinstance(law, js.fluid.SlideLaw) else np.ones(3)
     energy = mass * speed**2 / charge
     # Per q_i q_j: 3 beta / r^4 where beta / (2 r^2) is the energy; 624 epsilon sigma^12 / r^14 where 4 epsilon (sigma / r)^12 is.
-    k = 12 * energy**2 / 1.3 if isinstance(law, js.SlideLaw) else 624 * 0.7 / 0.9**2 * (energy / 2.8) ** (14 / 12)
+    k = 12 * energy**2 / 1.3 if isinstance(law, js.fluid.SlideLaw) else 624 * 0.7 / 0.9**2 * (energy / 2.8) ** (14 / 12)
     expected = 2 / np.sqrt(2 * charge * k / mass)
     limit, node = system.bind(state.dtype).forces[0].collision_dt(state)
     assert float(limit) == pytest.approx(expected.min(), rel=1e-12)
@@ -142,14 +141,14 @@ def test_a_step_too_long_for_a_collision_is_told_in_both_directions():
     slow = state.moved(state.position, 0.1 * state.velocity)
     for before, after, share, is_told in ((slow, state, 1.01, True), (slow, state, 0.99, False), (state, slow, 1.01, False)):
         for sign in (1, -1):
-            status = fluid.update(Step(before, after, jnp.asarray(sign * share * limit)), after)[1]
+            status = fluid.update(js.Step(before, after, jnp.asarray(sign * share * limit)), after)[1]
             assert bool(status.has(js.Flag.DT_LIMIT)) == is_told
 
 
 def test_drag_as_printed(rng):
     """-eta (1 - r/R)^2 ((v_i - v_j) . u) u for every pair nearer than R, nothing beyond; pair by pair in NumPy, beside the law's force."""
     points, velocities = blob(rng, 20), rng.normal(size=(20, 3))
-    system, state = make(points, velocities=velocities, drag=js.PairDrag(0.7, 1.6))
+    system, state = make(points, velocities=velocities, drag=js.fluid.PairDrag(0.7, 1.6))
     expected = slide_force(points, np.ones(20))
     n_near = 0
     for i in range(20):
@@ -171,7 +170,7 @@ def test_a_cut_off_ends_without_a_step_in_energy(law, cutoff):
     assert abs(float(cutoff.potential(law, jnp.asarray((c - hair) ** 2)))) < 1e-8
     for r in (c, 5.0):
         assert float(cutoff.potential(law, jnp.asarray(r * r))) == float(cutoff.weight(law, jnp.asarray(r * r))) == 0
-    if isinstance(cutoff, js.Switched):
+    if isinstance(cutoff, js.fluid.Switched):
         at = jnp.linspace(0.6, 1.6, 6) ** 2
         np.testing.assert_allclose(cutoff.weight(law, at), law.weight(at), rtol=1e-13)
         np.testing.assert_allclose(cutoff.potential(law, at), law.potential(at) - law.potential(jnp.asarray(c * c)), rtol=1e-12)
@@ -221,7 +220,7 @@ def test_triangle_and_tetrahedron_rest_at_r0(corners):
 
 def test_two_particles_swing_at_the_frequency():
     """A small oscillation crosses zero after a quarter of 2 pi / omega, omega = sqrt(k_0 (1/m_1 + 1/m_2) m_1 m_2)."""
-    law = js.SlideLaw(1.0, 1.0, 0.1)
+    law = js.fluid.SlideLaw(1.0, 1.0, 0.1)
     omega = float(jnp.sqrt(law.contact_stiffness * 2))
     r = float(law.equilibrium_distance)
     system, state = make(np.array([[0.0, 0.0], [r + 1e-6, 0.0]]))
@@ -249,7 +248,7 @@ def test_clusters_contract_as_they_grow():
         13: [[0, 0, 0], *(np.roll(p, k) / 2 for p in np.array(icosahedron) for k in range(3))],
     }
     for n, shape in shapes.items():
-        system, state = make(np.array(shape, float), law=js.SlideLaw(1.0, 1.0))
+        system, state = make(np.array(shape, float), law=js.fluid.SlideLaw(1.0, 1.0))
         damped = js.System(system.net, mass=1.0, forces=(*system.forces, js.Drag(2.0)))
         end = np.asarray(js.rollout(damped, state, js.SymplecticEuler(), 0.03, 1500).state.points)
         distances = np.linalg.norm(end[:, None] - end[None], axis=-1) + 9 * np.eye(n)
@@ -257,10 +256,10 @@ def test_clusters_contract_as_they_grow():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("pairs", [js.AllPairs(), js.NeighbourList(40, 0.4)], **by_name)
+@pytest.mark.parametrize("pairs", [js.fluid.AllPairs(), js.fluid.NeighbourList(40, 0.4)], **by_name)
 def test_momentum_and_angular_momentum_stay(pairs, rng):
     """Both, with drag between the pairs and unequal masses, over 60 steps to rounding, while the drag takes energy."""
-    options = {"cutoff": js.ShiftedForce(2.5), "pairs": pairs, "drag": js.PairDrag(0.5, 2.0)}
+    options = {"cutoff": js.fluid.ShiftedForce(2.5), "pairs": pairs, "drag": js.fluid.PairDrag(0.5, 2.0)}
     system, state = make(blob(rng, 30), rng.uniform(0.5, 2, 30), velocities=rng.normal(0, 0.3, (30, 3)), **options)
     result = js.rollout(system, state, js.SymplecticEuler(), 5e-3, 60)
     js.raise_for_status(result)
@@ -275,7 +274,7 @@ def test_momentum_and_angular_momentum_stay(pairs, rng):
 def test_forces_add_up_to_nothing(seed, which, has_drag):
     """Total force and total torque are zero to rounding for any law, masses, positions and velocities."""
     rng = np.random.default_rng(seed)
-    drag = js.PairDrag(rng.uniform(0, 2), 1.5) if has_drag else None
+    drag = js.fluid.PairDrag(rng.uniform(0, 2), 1.5) if has_drag else None
     points = rng.uniform(0, 3, (16, 3))
     system, state = make(points, rng.uniform(0.1, 3, 16), LAWS[which], core=0.2, drag=drag, velocities=rng.normal(size=(16, 3)))
     force = components(system.force(state))
@@ -287,7 +286,7 @@ def test_forces_add_up_to_nothing(seed, which, has_drag):
 @pytest.mark.parametrize(("r", "stiffness"), [(0.8, 3 / 0.8**4 - 1 / 0.8**2), (3.0, 1 / 3**2 - 1 / 3**4)])
 def test_bound_of_stiffness_of_a_pair(r, stiffness):
     """Two particles: the bound is exact, 2 / sqrt(2 k), k along the pair where near, and across it where they attract from afar."""
-    system, state = make(np.array([[0.0, 0.0], [r, 0.0]]), law=js.SlideLaw(1.0, 1.0))
+    system, state = make(np.array([[0.0, 0.0], [r, 0.0]]), law=js.fluid.SlideLaw(1.0, 1.0))
     assert float(js.stable_dt(system, state)) == pytest.approx(2 / np.sqrt(2 * stiffness), rel=1e-12)
 
 
@@ -309,7 +308,7 @@ def test_bound_of_stiffness_holds(rng):
 def test_damping_bound_holds(rng):
     """Twice the sum of the drag coefficients is at least the largest eigenvalue of -dF/dv."""
     points = blob(rng, 12, spacing=0.8)
-    system, state = make(points, drag=js.PairDrag(0.7, 1.5))
+    system, state = make(points, drag=js.fluid.PairDrag(0.7, 1.5))
 
     @jax.jit
     def top_eigenvalue(flat):

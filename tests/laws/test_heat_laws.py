@@ -16,7 +16,7 @@ from jaxspring.thermal.phase import Equation, relaxed, searched
 
 NET = js.lattice((3, 4))
 GRAPH = js.Graph.from_edges(NET.edges[::-1], 12)
-IMPLICIT = [js.BackwardEulerHeat(), js.CrankNicolsonHeat(), js.SplitHeat(), js.SymmetricSplitHeat()]
+IMPLICIT = [js.thermal.BackwardEulerHeat(), js.thermal.CrankNicolsonHeat(), js.thermal.SplitHeat(), js.thermal.SymmetricSplitHeat()]
 
 
 @eqx.filter_jit
@@ -26,7 +26,7 @@ def run(scheme, net, c, g, t, latent, q, dt):
     system = js.System(net, 1.0, rules=heat)
     start = system.begin(js.State.from_points(net, NET.grid(), temperature=t))
     result = js.rollout(system, start, js.Still(), dt, 5)
-    total = [js.total_heat(heat, state) for state in (start, result.state)]
+    total = [js.thermal.total_heat(heat, state) for state in (start, result.state)]
     return result.status, result.state.temperatures, total, 5 * dt * jnp.sum(q)
 
 
@@ -50,12 +50,12 @@ def test_heat_is_kept(scheme, melts, seed, log_dt, log_latent, heated):
     solves end at 1e-8.
     """
     rng, c, g, t = body(seed)
-    latent = js.LatentHeat(350.0, jnp.asarray(10**log_latent)) if melts else None
+    latent = js.thermal.LatentHeat(350.0, jnp.asarray(10**log_latent)) if melts else None
     q = jnp.asarray(rng.normal(size=12) * heated)
     status, end, (before, after), given_heat = run(scheme, NET, c, g, t, latent, q, jnp.asarray(10**log_dt))
     scale = float(before) + float(jnp.sum(jnp.abs(q))) * 5 * 10**log_dt
     # Half an explicit step of Crank-Nicolson moves up to dt G theta about, whose rounding is kept.
-    moved = 10**log_dt * 1e3 * 100 if isinstance(scheme, (js.CrankNicolsonHeat, js.SymmetricSplitHeat)) else 0.0
+    moved = 10**log_dt * 1e3 * 100 if isinstance(scheme, (js.thermal.CrankNicolsonHeat, js.thermal.SymmetricSplitHeat)) else 0.0
     assert abs(float(after - before - given_heat)) <= 1e-12 * (scale + moved)
     assert np.all(np.isfinite(end))
     if log_dt < 0:
@@ -70,7 +70,7 @@ def test_heat_is_kept(scheme, melts, seed, log_dt, log_latent, heated):
 def test_no_new_extreme(scheme, melts, seed, log_dt, log_latent):
     """Without sources no node becomes hotter than the hottest or colder than the coldest was, at any dt, to the solver's tolerance."""
     _, c, g, t = body(seed)
-    latent = js.LatentHeat(350.0, jnp.asarray(10**log_latent)) if melts else None
+    latent = js.thermal.LatentHeat(350.0, jnp.asarray(10**log_latent)) if melts else None
     status, end, _, _ = run(scheme, NET, c, g, t, latent, jnp.zeros(12), jnp.asarray(10**log_dt))
     if bool(status.is_ok):
         slack = 1e-4 * float(jnp.ptp(t))
@@ -104,7 +104,7 @@ def test_every_chain_that_melts_is_solved(rng):
     @jax.jit
     @jax.vmap
     def step(c, g, t, latent):
-        heat = js.Heat(net, c, g, js.SplitHeat(), latent=js.LatentHeat(350.0, latent))
+        heat = js.Heat(net, c, g, js.thermal.SplitHeat(), latent=js.thermal.LatentHeat(350.0, latent))
         start = js.State.from_points(net, net.grid(), temperature=t)
         end = js.rollout(js.System(net, 1.0, rules=heat), start, js.Still(), 1.0, 1)
         return end.status.flags, end.state.temperature, end.state.enthalpy
@@ -168,8 +168,10 @@ def test_explicit_heat_up_to_its_limit(seed, share, log_latent):
     _, c, g, t = body(seed)
     heat = js.Heat(NET, c, g)
     limit = float(js.stable_dt(js.System(NET, 1.0, rules=heat), js.State.from_points(NET, NET.grid(), temperature=t)))
-    latent = js.LatentHeat(350.0, jnp.asarray(10**log_latent))
-    status, end, (before, after), _ = run(js.ExplicitHeat(), NET, c, g, t, latent, jnp.zeros(12), jnp.asarray(min(share * limit, 1e3)))
+    latent = js.thermal.LatentHeat(350.0, jnp.asarray(10**log_latent))
+    status, end, (before, after), _ = run(
+        js.thermal.ExplicitHeat(), NET, c, g, t, latent, jnp.zeros(12), jnp.asarray(min(share * limit, 1e3))
+    )
     assert not bool(status.has(Flag.DT_LIMIT))
     assert float(jnp.min(t)) - 1e-10 <= float(jnp.min(end)) <= float(jnp.max(end)) <= float(jnp.max(t)) + 1e-10
     assert float(after) == pytest.approx(float(before), rel=1e-13)
@@ -179,8 +181,8 @@ def test_explicit_heat_up_to_its_limit(seed, share, log_latent):
 def test_a_graph_is_its_lattice(rng):
     """The same springs as a graph, in another order, give the lattice's temperatures, implicit and with latent heat."""
     _, c, g, t = body(7)
-    latent = js.LatentHeat(350.0, 30.0)
-    scheme = js.BackwardEulerHeat(js.JaxCG(1e-13), js.HeatIteration(1e-13))
+    latent = js.thermal.LatentHeat(350.0, 30.0)
+    scheme = js.thermal.BackwardEulerHeat(js.JaxCG(1e-13), js.thermal.HeatIteration(1e-13))
     on_lattice = run(scheme, NET, c, g, t, latent, jnp.ones(12), jnp.asarray(0.5))[1]
     on_graph = run(scheme, GRAPH, c, g[::-1], t, latent, jnp.ones(12), jnp.asarray(0.5))[1]
     np.testing.assert_allclose(on_graph, on_lattice, rtol=1e-10)
@@ -188,10 +190,10 @@ def test_a_graph_is_its_lattice(rng):
 
 def test_float32_stays_float32(dtype):
     """Temperatures and enthalpies keep the state's precision, whatever that of the constants, with heat kept to its rounding."""
-    heat = js.Heat(NET, 1.0, np.full(17, 0.2), js.BackwardEulerHeat(), latent=js.LatentHeat(350.0, 20.0))
+    heat = js.Heat(NET, 1.0, np.full(17, 0.2), js.thermal.BackwardEulerHeat(), latent=js.thermal.LatentHeat(350.0, 20.0))
     start = js.State.from_points(NET, NET.grid().astype(dtype), temperature=np.linspace(300, 400, 12))
     system = js.System(NET, 1.0, rules=heat)
     end = js.rollout(system, start, js.Still(), 0.7, 20).state
     assert end.temperature.dtype == end.enthalpy.dtype == dtype
-    gain = float(js.total_heat(heat, end) / js.total_heat(heat, system.begin(start))) - 1
+    gain = float(js.thermal.total_heat(heat, end) / js.thermal.total_heat(heat, system.begin(start))) - 1
     assert abs(gain) <= 100 * np.finfo(dtype).eps

@@ -129,7 +129,7 @@ def test_a_ledger_changes_nothing():
     start = js.State.from_points(NET, NET.grid() + np.array([0.0, 0.02]), temperature=300.0)
     frames = {}
     for has_books in (True, False):
-        heat = js.Heat(js.lattice((3, 4)), 1.0, 1.0, boundaries=js.HotPlane(GROUND, UP, 500.0, 6.0, 1.0, reach=0.5))
+        heat = js.Heat(js.lattice((3, 4)), 1.0, 1.0, boundaries=js.thermal.HotPlane(GROUND, UP, 500.0, 6.0, 1.0, reach=0.5))
         rules = (heat, js.Fusing(NET, 350.0), js.Floor(GROUND, UP, 0.2))
         forces = (js.Springs(NET, js.ThermalStiffness(40.0, 310.0, 350.0), 0.9), js.Gravity((0.0, -6.0)))
         system = js.System(NET, 1.0, forces, rules=(js.Ledger(), *rules) if has_books else rules)
@@ -172,7 +172,7 @@ def test_work_of_drag_between_particles():
     """Of a fluid with drag, only the drag is work; the rest is its potential. What is left is the error of the steps, of order one."""
     error = []
     for n_steps in (100, 800):
-        book, system, end = molten_pair(lambda net: js.Fusing(net, 350.0), js.PairDrag(0.5, 2.0), 0.4 / n_steps, n_steps)
+        book, system, end = molten_pair(lambda net: js.Fusing(net, 350.0), js.fluid.PairDrag(0.5, 2.0), 0.4 / n_steps, n_steps)
         assert book["work"]["Fluid"] < -0.05
         error.append(abs(book["integration"]))
     assert 6 < error[0] / error[1] < 10

@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jaxspring as js
-from jaxspring.forces.base import Rule
 from jaxspring.status import Status
 
 NET = js.lattice((3, 4), js.STRUCTURAL + js.SHEAR)
@@ -35,7 +34,7 @@ def softened(dtype):
     @jax.jit
     def both(temperature, softening, melting, sharpness):
         state = js.State.from_points(NET, jnp.zeros((N, 2), dtype), temperature=temperature)
-        rules = (js.ThermalStiffness(FULL, softening, melting), js.ThermalStiffness(FULL, softening, melting, sharpness))
+        rules = (js.thermal.ThermalStiffness(FULL, softening, melting), js.thermal.ThermalStiffness(FULL, softening, melting, sharpness))
         return tuple(NET.flatten(rule.stiffness(NET, state)) for rule in rules)
 
     return lambda *numbers: tuple(np.asarray(k, float) for k in both(*(jnp.asarray(n, dtype) for n in numbers)))
@@ -61,7 +60,7 @@ def test_softening_stays_within_bounds(precision, seed, log_width, log_far, log_
     assert np.abs(np.subtract(smooth, exact)).max() <= FULL * np.log(2) / b + rounding
 
 
-class Warmed(Rule):
+class Warmed(js.Rule):
     """Gives the nodes the temperatures and places of a list, one entry a step."""
 
     temperatures: jax.Array
@@ -90,7 +89,7 @@ def history(temperatures, points, stiffness, hysteresis, reach):
 
         return js.rollout(system, start, js.Still(), 0.5, STEPS, save_every=1, observe=look).saved
 
-    return run(None), run(js.Refreezing(hysteresis, reach))
+    return run(None), run(js.thermal.Refreezing(hysteresis, reach))
 
 
 @settings(max_examples=60)
@@ -132,7 +131,7 @@ def test_springs_fuse_and_come_back(seed, swing, hysteresis, reach):
 @jax.jit
 def phases(y, melting, latent, capacity):
     """Temperatures, latent heats, and y made of them again."""
-    law = js.LatentHeat(melting, latent)
+    law = js.thermal.LatentHeat(melting, latent)
     theta, h = law.temperature(y, capacity), law.enthalpy(y, capacity)
     return theta, h, law.joined(theta, h, capacity)
 
@@ -189,7 +188,7 @@ def test_an_insulated_body_melts(seed, hot, log_latent, log_conductance):
     system = scene(latent, conductance)
     book = js.energy_ledger(system, end)
     heat = system.rules[0].rules[0]
-    assert float(js.total_heat(heat, end)) == pytest.approx(float(js.total_heat(heat, start)), rel=1e-14)
+    assert float(js.thermal.total_heat(heat, end)) == pytest.approx(float(js.thermal.total_heat(heat, start)), rel=1e-14)
     assert abs(book["rules"]["Heat"]["heat"]) <= 1e-11
     fusing = book["rules"]["Fusing"]
     assert fusing["Springs"] <= 0

@@ -104,7 +104,7 @@ def test_a_squeezed_run_of_implicit_steps_loses_energy(body):
     points = 0.7 * flat + 0.05 * np.random.default_rng(3).normal(size=flat.shape)
     start = js.State.from_points(system.net, points)
     dt = 10 * js.stable_dt(pinned, start)
-    solver = js.CG(preconditioner=js.Jacobi())
+    solver = js.CG(preconditioner=js.linalg.Jacobi())
     run = js.rollout(pinned, start, js.BackwardEuler(solver), dt, 4, save_every=1, observe=lambda s: pinned.energy(s).total)
     js.raise_for_status(run)
     assert np.all(np.diff([pinned.energy(start).total, *run.saved]) < 0)

@@ -10,13 +10,13 @@ import scipy.special
 
 import jaxspring as js
 
-FINE, ITERATION = js.JaxCG(tolerance=1e-13), js.HeatIteration(tolerance=1e-13)
+FINE, ITERATION = js.JaxCG(tolerance=1e-13), js.thermal.HeatIteration(tolerance=1e-13)
 SCHEMES = [
-    (js.ExplicitHeat(), 1),
-    (js.BackwardEulerHeat(FINE, ITERATION), 1),
-    (js.CrankNicolsonHeat(FINE, ITERATION), 2),
-    (js.SplitHeat(ITERATION), 1),
-    (js.SymmetricSplitHeat(ITERATION), 2),
+    (js.thermal.ExplicitHeat(), 1),
+    (js.thermal.BackwardEulerHeat(FINE, ITERATION), 1),
+    (js.thermal.CrankNicolsonHeat(FINE, ITERATION), 2),
+    (js.thermal.SplitHeat(ITERATION), 1),
+    (js.thermal.SymmetricSplitHeat(ITERATION), 2),
 ]
 
 
@@ -28,16 +28,16 @@ def after(heat, temperature, dt, n_steps):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("scheme", "order"), SCHEMES, ids=lambda p: type(p).__name__ if isinstance(p, js.HeatScheme) else str(p))
+@pytest.mark.parametrize(("scheme", "order"), SCHEMES, ids=lambda p: type(p).__name__ if isinstance(p, js.thermal.HeatScheme) else str(p))
 def test_error_falls_as_dt_to_the_order(scheme, order):
     """A sheet that convects, radiates, is heated in time and held at a corner: halving dt divides the distance from SciPy by 2**order."""
     net, rng = js.lattice((3, 4)), np.random.default_rng(3)
     c, g = rng.uniform(1, 2, 12), rng.uniform(0.5, 1.5, net.n_springs)
     here, held, t0 = np.arange(12) < 5, np.arange(12) == 11, rng.uniform(300, 900, 12)
     boundaries = (
-        js.FixedTemperature(net, held, lambda t: 500.0 + 100.0 * t),
-        js.Convection(net, here, 2.0, 280.0, 0.3),
-        js.Radiation(net, ~here, 0.9, 400.0, 0.5),
+        js.thermal.FixedTemperature(net, held, lambda t: 500.0 + 100.0 * t),
+        js.thermal.Convection(net, here, 2.0, 280.0, 0.3),
+        js.thermal.Radiation(net, ~here, 0.9, 400.0, 0.5),
     )
 
     def source(t):
@@ -73,7 +73,9 @@ def block():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("scheme", "order"), [(js.SplitHeat(), 1), (js.SymmetricSplitHeat(), 2)], ids=lambda p: type(p).__name__)
+@pytest.mark.parametrize(
+    ("scheme", "order"), [(js.thermal.SplitHeat(), 1), (js.thermal.SymmetricSplitHeat(), 2)], ids=lambda p: type(p).__name__
+)
 def test_axes_in_turn_have_their_order_in_space(block, scheme, order):
     """Against the matrix exponential of a block: halving dt divides the error by 2**order, and heat is kept to rounding."""
     net, c, g, t0, rates = block
@@ -91,7 +93,7 @@ def test_the_symmetric_split_is_stable_in_space(block, dt):
     """The distance from the mean, weighed with the capacities, shrinks in every one of 100 steps of any length."""
     net, c, g, t0, _ = block
     start = js.State.from_points(net, net.grid(), temperature=t0)
-    system = js.System(net, 1.0, rules=js.Heat(net, c, g, js.SymmetricSplitHeat()))
+    system = js.System(net, 1.0, rules=js.Heat(net, c, g, js.thermal.SymmetricSplitHeat()))
     seen = every_temperature(system, start, jnp.asarray(dt))
     distance = np.sqrt((c * (np.vstack([t0, seen]) - np.sum(c * t0) / np.sum(c)) ** 2).sum(1))
     assert np.all((np.diff(distance) < 0) | (distance[1:] < 1e-9))
@@ -109,9 +111,9 @@ def test_the_half_space():
     error = []
     for n in (20, 40):
         net, h = js.lattice(4 * n + 1), 1 / n
-        cells = js.HalfCells()
-        c, g = js.capacities(net, 1.0, 1.0, h, 1.0, cells), js.conductances(net, 1.0, h, 1.0, cells)
-        surface = js.FixedTemperature(net, np.arange(4 * n + 1) == 0, 1.0)
+        cells = js.thermal.HalfCells()
+        c, g = js.thermal.capacities(net, 1.0, 1.0, h, 1.0, cells), js.thermal.conductances(net, 1.0, h, 1.0, cells)
+        surface = js.thermal.FixedTemperature(net, np.arange(4 * n + 1) == 0, 1.0)
         end = after(js.Heat(net, c, g, boundaries=surface), 0.0, 0.4 * h * h, n * n // 2)
         x = np.arange(4 * n + 1) * h
         error.append(np.abs(np.asarray(end.temperature) - scipy.special.erfc(x / (2 * np.sqrt(0.2)))).max())
@@ -121,14 +123,16 @@ def test_the_half_space():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("stefan", "root"), [(0.5, 0.464786), (2.0, 0.800601)])
-@pytest.mark.parametrize(("scheme", "times"), [(js.ExplicitHeat(), 0.4), (js.BackwardEulerHeat(), 8.0)], ids=["explicit", "backward"])
+@pytest.mark.parametrize(
+    ("scheme", "times"), [(js.thermal.ExplicitHeat(), 0.4), (js.thermal.BackwardEulerHeat(), 8.0)], ids=["explicit", "backward"]
+)
 def test_the_front_of_melting(scheme, times, stefan, root):
     """Stefan's front s = 2 lambda sqrt(a t), lambda exp(lambda^2) erf lambda = Ste / sqrt(pi): within 1 % after 80 cells; heat kept."""
-    n, cells = 121, js.HalfCells()
+    n, cells = 121, js.thermal.HalfCells()
     net = js.lattice(n)
-    c, g = js.capacities(net, 1.0, 1.0, 1.0, 1.0, cells), js.conductances(net, 1.0, 1.0, 1.0, cells)
-    wall = js.FixedTemperature(net, np.arange(n) == 0, 1.0)
-    latent = js.LatentHeat(0.0, c / stefan)
+    c, g = js.thermal.capacities(net, 1.0, 1.0, 1.0, 1.0, cells), js.thermal.conductances(net, 1.0, 1.0, 1.0, cells)
+    wall = js.thermal.FixedTemperature(net, np.arange(n) == 0, 1.0)
+    latent = js.thermal.LatentHeat(0.0, c / stefan)
     n_steps = int((80 / (2 * root)) ** 2 / times)
     heat = js.Heat(net, c, g, scheme, wall, latent=latent)
     end = after(heat, 0.0, times, n_steps)

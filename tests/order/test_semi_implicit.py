@@ -9,7 +9,7 @@ import pytest
 import jaxspring as js
 
 TIGHT = js.JaxCG(tolerance=1e-12)
-CHEAP = js.JaxCG(tolerance=1e-12, preconditioner=js.Unpreconditioned())  # to compile
+CHEAP = js.JaxCG(tolerance=1e-12, preconditioner=js.linalg.Unpreconditioned())  # to compile
 
 
 def chain(*damping):

@@ -16,15 +16,17 @@ def end(scheme, conductivity, melting, wall, traces=None):
     """Temperatures after five steps over a hot plane."""
     if traces is not None:
         traces()
-    plane = js.HotPlane((0.0, 0.0), (0.0, 1.0), wall, 5.0, 0.1, reach=0.5, fade=1.0)
-    heat = js.Heat(NET, 1.0, js.conductances(NET, conductivity, 1.0), scheme, plane, latent=js.LatentHeat(melting, 10.0))
+    plane = js.thermal.HotPlane((0.0, 0.0), (0.0, 1.0), wall, 5.0, 0.1, reach=0.5, fade=1.0)
+    heat = js.Heat(NET, 1.0, js.thermal.conductances(NET, conductivity, 1.0), scheme, plane, latent=js.thermal.LatentHeat(melting, 10.0))
     start = js.State.from_points(NET, NET.grid(), temperature=T0)
     return js.rollout(js.System(NET, 1.0, rules=heat), start, js.Still(), 0.2, 5).state.temperature
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "scheme", [js.ExplicitHeat(), js.BackwardEulerHeat(), js.SplitHeat(), js.SymmetricSplitHeat()], ids=lambda s: type(s).__name__
+    "scheme",
+    [js.thermal.ExplicitHeat(), js.thermal.BackwardEulerHeat(), js.thermal.SplitHeat(), js.thermal.SymmetricSplitHeat()],
+    ids=lambda s: type(s).__name__,
 )
 def test_traced_once_and_batched(scheme):
     """Three sets of constants share one program, and a batch of them gives what they give one by one, to 1e-6 of a kelvin."""
@@ -40,7 +42,7 @@ def test_traced_once_and_batched(scheme):
 @pytest.mark.slow
 def test_no_scatter():
     """The gradient through implicit steps with latent heat holds no scatter, by conductivities in the user's order."""
-    program = jax.jit(jax.grad(lambda c: jnp.sum(end(js.BackwardEulerHeat(), c, 340.0, 500.0)))).lower(jnp.ones(12))
+    program = jax.jit(jax.grad(lambda c: jnp.sum(end(js.thermal.BackwardEulerHeat(), c, 340.0, 500.0)))).lower(jnp.ones(12))
     assert "scatter" not in program.as_text()
 
 
@@ -48,7 +50,7 @@ def test_the_plane_heats_by_its_place():
     """With a fade the heat has a derivative by the position of the nodes: that of the ramp; without one, zero."""
 
     def heat_in(height, fade):
-        plane = js.HotPlane((0.0, 0.0), (0.0, 1.0), 500.0, 5.0, 0.1, reach=0.5, fade=fade)
+        plane = js.thermal.HotPlane((0.0, 0.0), (0.0, 1.0), 500.0, 5.0, 0.1, reach=0.5, fade=fade)
         state = js.State.from_points(NET, jnp.full((12, 2), height), temperature=300.0)
         return jnp.sum(plane.power(state, state.temperature))
 

@@ -51,7 +51,7 @@ def test_b8_a_flat_chain_under_a_side_load():
     assert float(found.state.points[1, 1]) == pytest.approx(sag, rel=1e-9)
     # Across the plane of chain and load the sagged springs are taut, so this is a minimum.
     assert bool(found.status.is_ok)
-    matrix = system.matrix(system.stiffness_blocks(start, js.ExactTangent()), start)
+    matrix = system.matrix(system.stiffness_blocks(start, js.steppers.ExactTangent()), start)
     _, info = js.CG().solve(matrix, system.force(start))
     assert not bool(info.status.is_ok)
 

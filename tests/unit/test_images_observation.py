@@ -15,9 +15,9 @@ from jaxspring.images import (
     Intensity,
     adaptation,
     gradient_magnitude,
-    image_gradient,
     principal_curvatures,
 )
+from jaxspring.images.observation import image_gradient
 
 
 def wavy(ny=14, nx=17):

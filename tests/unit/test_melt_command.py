@@ -163,7 +163,7 @@ def test_an_interrupted_block_goes_on():
     assert bool(broken.status.has(js.Flag.INTERRUPTED))
     done = int(broken.info.n_steps)
     assert 300 <= done < 350
-    assert 0 < js.melted_fraction(scene.net, broken.state) < js.melted_fraction(scene.net, whole.state)
+    assert 0 < js.thermal.melted_fraction(scene.net, broken.state) < js.thermal.melted_fraction(scene.net, whole.state)
     rest = run(broken.state, 600 - done, resume=broken.resume)
     js.raise_for_status(rest)
     for a, b in zip(jax.tree.leaves(rest.state), jax.tree.leaves(whole.state), strict=True):

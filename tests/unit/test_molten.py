@@ -9,7 +9,6 @@ import pytest
 import scipy.integrate
 
 import jaxspring as js
-from jaxspring.forces.base import Step
 from jaxspring.forces.cutoffs import Cutoff
 from jaxspring.numerics import any_lane
 from tests.particles import components
@@ -17,7 +16,7 @@ from tests.particles import components
 CALLS = []
 
 
-class CountedLaw(js.SlideLaw):
+class CountedLaw(js.fluid.SlideLaw):
     """The slides' law, telling the host each time a tile of pairs is evaluated."""
 
     def weight(self, squared):
@@ -29,7 +28,7 @@ class CountedLaw(js.SlideLaw):
 def scene(law=None, **options):
     """A row of five particles, four springs; the state has all springs alive."""
     net = js.lattice(5)
-    fluid = js.Fluid(js.gentle_fluid(1.0) if law is None else law, molten=js.Molten(net), **options)
+    fluid = js.Fluid(js.fluid.gentle_fluid(1.0) if law is None else law, molten=js.fluid.Molten(net), **options)
     system = js.System(net, mass=1.0, forces=(js.Springs(net, 10.0, 1.0), fluid))
     return net, system, js.State.from_points(net, [[0.0, 0], [0.9, 0.1], [2.0, 0], [2.9, 0], [4.2, 0]])
 
@@ -47,39 +46,39 @@ def force_of_fluid(system, state):
 def test_a_particle_is_fluid_when_its_last_spring_has_broken():
     """Springs 0-1 and 1-2 broken: particles 0 and 1 are fluid, 2 still holds on; with no `alive` nothing is."""
     net, _, state = scene()
-    molten = js.Molten(net)
+    molten = js.fluid.Molten(net)
     assert np.asarray(molten.is_fluid(with_springs(net, state, [0, 0, 1, 1]))).tolist() == [True, True, False, False, False]
     assert not np.asarray(molten.is_fluid(state)).any()
     lonely = js.Graph.from_edges(np.array([[0, 1]]), 3)
     at = js.State.from_points(lonely, np.zeros((3, 2)))
-    assert np.asarray(lonely.flatten_nodes(js.Molten(lonely).is_fluid(at))).tolist() == [False, False, True]
+    assert np.asarray(lonely.flatten_nodes(js.fluid.Molten(lonely).is_fluid(at))).tolist() == [False, False, True]
 
 
 def test_melted_fraction():
     """Two of five particles without a living spring: 0.4; none, and all of them, at the ends."""
     net, _, state = scene()
     for alive, share in (([0, 0, 1, 1], 0.4), ([1, 1, 1, 1], 0.0), ([0, 0, 0, 0], 1.0)):
-        assert float(js.melted_fraction(net, with_springs(net, state, alive))) == share
+        assert float(js.thermal.melted_fraction(net, with_springs(net, state, alive))) == share
 
 
 def test_molten_of_another_net_than_the_springs():
     """A fluid, and a share that has melted, on a net whose springs are not those that break are refused with both nets."""
     bare, sheared = js.lattice((3, 3)), js.lattice((3, 3), js.STRUCTURAL + js.SHEAR)
     state = js.State.from_points(sheared, sheared.grid())
-    fluid = js.Fluid(js.gentle_fluid(1.0), molten=js.Molten(bare))
+    fluid = js.Fluid(js.fluid.gentle_fluid(1.0), molten=js.fluid.Molten(bare))
     system = js.System(sheared, 1.0, (js.Springs(sheared, 1.0, 1.0), fluid))
     both = r"Molten has a Lattice of 12 springs .* Springs of this system have a Lattice of 20 springs"
     with pytest.raises(ValueError, match=both):
         system.force(state)
-    whole = js.EdgeField(tuple(jnp.ones(shape, bool) for shape in sheared.family_shapes))
+    whole = js.topology.EdgeField(tuple(jnp.ones(shape, bool) for shape in sheared.family_shapes))
     with pytest.raises(ValueError, match=r"state.alive tells about springs .* Lattice of 12 springs"):
-        js.melted_fraction(bare, dataclasses.replace(state, alive=whole))
+        js.thermal.melted_fraction(bare, dataclasses.replace(state, alive=whole))
 
 
-@pytest.mark.parametrize("pairs", [js.AllPairs(), js.AllPairs(2), js.NeighbourList(8, 0.5)], ids=["all", "tiles", "list"])
+@pytest.mark.parametrize("pairs", [js.fluid.AllPairs(), js.fluid.AllPairs(2), js.fluid.NeighbourList(8, 0.5)], ids=["all", "tiles", "list"])
 def test_mixed_pairs_repel_only(pairs):
     """Two fluid particles have the whole law, a fluid and a solid one its repulsion, two solid ones nothing; pair by pair in NumPy."""
-    net, system, state = scene(cutoff=js.PlainCutoff(9.0), pairs=pairs)
+    net, system, state = scene(cutoff=js.fluid.PlainCutoff(9.0), pairs=pairs)
     state = with_springs(net, state, [0, 0, 1, 1])
     points, fluid = np.asarray(state.points), [True, True, False, False, False]
     expected = np.zeros_like(points)
@@ -121,7 +120,7 @@ def test_energy_of_a_mixed_pair_is_the_work_of_its_repulsion(r):
 
 def test_what_is_solid_drags_counts_and_limits_nothing():
     """Drag, its bound, overlaps and the step for collisions look at what is fluid; a fluid one and a solid one drag."""
-    net, system, state = scene(drag=js.PairDrag(0.5, 2.0), core=0.95)
+    net, system, state = scene(drag=js.fluid.PairDrag(0.5, 2.0), core=0.95)
     speeds = np.array([[0.0, 0], [0, 0], [0, 0], [1, 0], [-9, 0]])
     state = dataclasses.replace(state, velocity=js.State.from_points(net, state.points, speeds).velocity)
     # Only particle 0 is fluid: beside it 1 stands still, and 2 and 3 are nearer to each other than the core.
@@ -143,7 +142,7 @@ def test_what_is_solid_drags_counts_and_limits_nothing():
     (overlaps,) = fluid.diagnose(at)
     assert (overlaps.flag, int(overlaps.count), int(overlaps.node)) == (js.Flag.OVERLAP, 1, 0)
     assert float(fluid.collision_dt(at)[0]) == np.inf
-    assert int(fluid.update(Step(at, at, jnp.asarray(1.0)), at)[1].flags) == 0
+    assert int(fluid.update(js.Step(at, at, jnp.asarray(1.0)), at)[1].flags) == 0
 
 
 def test_bound_of_stiffness_of_a_mixed_pair():
@@ -179,7 +178,7 @@ def test_no_pair_is_evaluated_before_something_melts():
     np.testing.assert_allclose(lanes.x[1], force(melted).x, rtol=1e-14)
 
 
-class CountedPairs(js.AllPairs):
+class CountedPairs(js.fluid.AllPairs):
     """Every pair, telling the host each time they are gone through, for whatever term."""
 
     def visit(self, *arguments):
@@ -201,7 +200,7 @@ def test_a_run_goes_through_no_pairs_before_something_melts():
     def run(temperature):
         start = js.State.from_points(net, 1.02 * net.grid(), temperature=temperature)
         result = js.rollout(system, start, js.SymplecticEuler(), 0.01, 12)
-        return js.melted_fraction(net, result.state), result.status.flags
+        return js.thermal.melted_fraction(net, result.state), result.status.flags
 
     def passes(function, temperature):
         CALLS.clear()
@@ -246,34 +245,42 @@ class Endless(Cutoff):
         return law.potential(squared)
 
 
-LISTED = js.Fluid(js.SlideLaw(1.0, 1.0), js.PlainCutoff(2.0), js.NeighbourList(8, 0.1))
+LISTED = js.Fluid(js.fluid.SlideLaw(1.0, 1.0), js.fluid.PlainCutoff(2.0), js.fluid.NeighbourList(8, 0.1))
 
 
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: js.SlideLaw(-1.0, 1.0), "alpha = -1.0, but must be positive"),
-        (lambda: js.SlideLaw(1.0, np.nan), "beta = nan, but must be finite"),
-        (lambda: js.SlideLaw(1.0, 1.0, -0.1), "zeta = -0.1, but must be zero or more"),
-        (lambda: js.SlideLaw(1.0, 1.0, a=4, b=4), "a = 4, b = 4"),
-        (lambda: js.SlideLaw(1.0, np.ones(3)), "beta has shape"),
-        (lambda: js.Switched(2.0, 1.5), "on = 2.0 is not below off = 1.5"),
-        (lambda: js.AllPairs(0), "tile = 0"),
-        (lambda: js.NeighbourList(0, 0.1), "capacity = 0"),
-        (lambda: js.NeighbourList(8, 0.0), "skin = 0.0, but must be positive"),
-        (lambda: js.NeighbourList(8, -1.0), "skin = -1.0, but must be positive. The list would be out of date"),
-        (lambda: js.PairDrag(-1.0, 1.0), "damping = -1.0"),
-        (lambda: js.PairDrag(1.0, 0.0), "radius = 0.0, but must be positive. No pair would be within it"),
-        (lambda: js.PlainCutoff(0.0), "radius = 0.0, but must be positive. No pair would be within it"),
-        (lambda: js.Switched(-1.0, 2.0), "on = -1.0, but must be positive. A switch fades"),
-        (lambda: js.gentle_fluid(-1.0), "spacing = -1.0, but must be positive. Particles of a lattice"),
-        (lambda: js.Fluid(js.SlideLaw(1.0, 1.0), core=0.0), "core = 0.0, but must be positive. Two particles at one place"),
-        (lambda: js.Fluid(js.SlideLaw(1.0, 1.0), pairs=js.NeighbourList(8, 0.1)), "a neighbour list needs a law that ends"),
-        (lambda: js.Fluid(js.SlideLaw(1.0, 1.0), Endless(), js.NeighbourList(8, 0.1)), "a neighbour list needs a law that ends"),
-        (lambda: js.Fluid(js.SlideLaw(1.0, 1.0), js.PlainCutoff(0.9)), "the equilibrium distance = 1.0 m is beyond the cut-off"),
-        (lambda: js.Fluid(js.SlideLaw(1.0, 1.0), js.PlainCutoff(2.0), core=3.0), "core = 3.0 m is beyond the cut-off"),
+        (lambda: js.fluid.SlideLaw(-1.0, 1.0), "alpha = -1.0, but must be positive"),
+        (lambda: js.fluid.SlideLaw(1.0, np.nan), "beta = nan, but must be finite"),
+        (lambda: js.fluid.SlideLaw(1.0, 1.0, -0.1), "zeta = -0.1, but must be zero or more"),
+        (lambda: js.fluid.SlideLaw(1.0, 1.0, a=4, b=4), "a = 4, b = 4"),
+        (lambda: js.fluid.SlideLaw(1.0, np.ones(3)), "beta has shape"),
+        (lambda: js.fluid.Switched(2.0, 1.5), "on = 2.0 is not below off = 1.5"),
+        (lambda: js.fluid.AllPairs(0), "tile = 0"),
+        (lambda: js.fluid.NeighbourList(0, 0.1), "capacity = 0"),
+        (lambda: js.fluid.NeighbourList(8, 0.0), "skin = 0.0, but must be positive"),
+        (lambda: js.fluid.NeighbourList(8, -1.0), "skin = -1.0, but must be positive. The list would be out of date"),
+        (lambda: js.fluid.PairDrag(-1.0, 1.0), "damping = -1.0"),
+        (lambda: js.fluid.PairDrag(1.0, 0.0), "radius = 0.0, but must be positive. No pair would be within it"),
+        (lambda: js.fluid.PlainCutoff(0.0), "radius = 0.0, but must be positive. No pair would be within it"),
+        (lambda: js.fluid.Switched(-1.0, 2.0), "on = -1.0, but must be positive. A switch fades"),
+        (lambda: js.fluid.gentle_fluid(-1.0), "spacing = -1.0, but must be positive. Particles of a lattice"),
+        (lambda: js.Fluid(js.fluid.SlideLaw(1.0, 1.0), core=0.0), "core = 0.0, but must be positive. Two particles at one place"),
+        (lambda: js.Fluid(js.fluid.SlideLaw(1.0, 1.0), pairs=js.fluid.NeighbourList(8, 0.1)), "a neighbour list needs a law that ends"),
         (
-            lambda: js.Fluid(js.SlideLaw(1.0, 1.0), js.PlainCutoff(2.0), js.NeighbourList(8, 0.1), js.PairDrag(1.0, 2.5)),
+            lambda: js.Fluid(js.fluid.SlideLaw(1.0, 1.0), Endless(), js.fluid.NeighbourList(8, 0.1)),
+            "a neighbour list needs a law that ends",
+        ),
+        (
+            lambda: js.Fluid(js.fluid.SlideLaw(1.0, 1.0), js.fluid.PlainCutoff(0.9)),
+            "the equilibrium distance = 1.0 m is beyond the cut-off",
+        ),
+        (lambda: js.Fluid(js.fluid.SlideLaw(1.0, 1.0), js.fluid.PlainCutoff(2.0), core=3.0), "core = 3.0 m is beyond the cut-off"),
+        (
+            lambda: js.Fluid(
+                js.fluid.SlideLaw(1.0, 1.0), js.fluid.PlainCutoff(2.0), js.fluid.NeighbourList(8, 0.1), js.fluid.PairDrag(1.0, 2.5)
+            ),
             "drag.radius = 2.5 m is beyond the cut-off",
         ),
     ],
@@ -288,8 +295,8 @@ def test_refusals(build, message):
 def test_a_list_rests_until_something_melts():
     """A flying chain that is cut on its way: its list is not remade before the cut, and the ends are those of all pairs."""
     net, found = js.lattice(5), []
-    for pairs in (js.AllPairs(), js.NeighbourList(8, 0.2)):
-        fluid = js.Fluid(js.gentle_fluid(1.0), js.ShiftedForce(2.5), pairs, molten=js.Molten(net))
+    for pairs in (js.fluid.AllPairs(), js.fluid.NeighbourList(8, 0.2)):
+        fluid = js.Fluid(js.fluid.gentle_fluid(1.0), js.fluid.ShiftedForce(2.5), pairs, molten=js.fluid.Molten(net))
         fusing = js.Fusing(net, 350.0)
         system = js.System(net, 1.0, (js.Springs(net, 10.0, 1.0), fluid), rules=fusing)
         points = 1.02 * np.arange(5.0)[:, None] * [[1.0, 0.0]]
@@ -303,7 +310,7 @@ def test_a_list_rests_until_something_melts():
     np.testing.assert_allclose(listed.points, everyone.points, rtol=1e-13)
 
 
-LJ = js.LennardJones(1.0, 1.0)
+LJ = js.fluid.LennardJones(1.0, 1.0)
 
 
 @pytest.mark.parametrize(
@@ -311,8 +318,8 @@ LJ = js.LennardJones(1.0, 1.0)
     [
         (lambda: js.Fluid(LJ, 2.5), r"cutoff is 2.5, a float; expected a Cutoff, e.g. ShiftedForce\(2.5\)"),
         (lambda: js.Fluid("lj"), "law is 'lj', a str; expected a PairLaw"),
-        (lambda: js.Fluid(js.LennardJones), "law is the class LennardJones; expected a PairLaw. Make one"),
-        (lambda: js.Fluid(LJ, js.PlainCutoff(2.5), "list"), "pairs is 'list', a str; expected a Pairs"),
+        (lambda: js.Fluid(js.fluid.LennardJones), "law is the class LennardJones; expected a PairLaw. Make one"),
+        (lambda: js.Fluid(LJ, js.fluid.PlainCutoff(2.5), "list"), "pairs is 'list', a str; expected a Pairs"),
         (lambda: js.Fluid(LJ, drag=0.5), "drag is 0.5, a float; expected a PairDrag"),
         (lambda: js.Fluid(LJ, molten=js.lattice(2)), r"molten is .*, a Lattice; expected a Molten, e.g. Molten\(net\)"),
     ],
@@ -325,6 +332,6 @@ def test_parts_of_another_kind(build, message):
 
 def test_whole_numbers_of_numpy():
     """Sizes may come from NumPy, and are kept as Python's."""
-    assert js.NeighbourList(np.int64(18), 0.3).capacity == js.NeighbourList(18, 0.3).capacity == 20
-    tile = js.AllPairs(np.int32(20)).tile
+    assert js.fluid.NeighbourList(np.int64(18), 0.3).capacity == js.fluid.NeighbourList(18, 0.3).capacity == 20
+    tile = js.fluid.AllPairs(np.int32(20)).tile
     assert (tile, type(tile)) == (20, int)

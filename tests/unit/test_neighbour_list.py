@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import jaxspring as js
-from jaxspring.forces.base import Step
 from jaxspring.forces.cells import find_neighbours
 from tests.particles import blob, components, free_net, make, slide_force
 
@@ -43,8 +42,8 @@ def test_the_list_is_remade_when_it_must_and_no_pair_is_missed(rng):
     """A hot fluid run with a list ends where it ends with all pairs, to rounding; the list was remade, but not in every step."""
     points, speeds = blob(rng, 64, spacing=1.2), rng.normal(0, 1.5, (64, 3))
     ends = []
-    for pairs in (js.AllPairs(), js.NeighbourList(64, 0.4)):
-        system, state = make(points, velocities=speeds, cutoff=js.ShiftedForce(2.5), pairs=pairs)
+    for pairs in (js.fluid.AllPairs(), js.fluid.NeighbourList(64, 0.4)):
+        system, state = make(points, velocities=speeds, cutoff=js.fluid.ShiftedForce(2.5), pairs=pairs)
         ends.append(js.rollout(system, state, js.VelocityVerlet(), 4e-3, 100))
     assert int(ends[1].status.flags) == 0
     np.testing.assert_allclose(ends[1].state.points, ends[0].state.points, atol=1e-9)
@@ -55,7 +54,7 @@ def test_the_list_is_remade_when_it_must_and_no_pair_is_missed(rng):
 def test_a_step_beyond_the_skin_is_told(rng):
     """A particle that goes a little farther than half the skin in one step raises DT_LIMIT: the list could not have known."""
     system, state = make(
-        blob(rng, 8, spacing=3.0), velocities=np.eye(8, 3) * 9.0, cutoff=js.ShiftedForce(2.5), pairs=js.NeighbourList(8, 0.1)
+        blob(rng, 8, spacing=3.0), velocities=np.eye(8, 3) * 9.0, cutoff=js.fluid.ShiftedForce(2.5), pairs=js.fluid.NeighbourList(8, 0.1)
     )
     fluid = system.bind(state.dtype).forces[0]
     begun = system.begin(state)
@@ -70,10 +69,10 @@ def test_a_pair_that_meets_within_a_step_is_listed():
     """Two particles farther apart than reach and skin come within reach in the middle of the second step, whose force must know them."""
     points, skin = np.array([[0.0, 0.0], [2.5 + 1.05 * 0.4, 0.0]]), 0.4
     ends = []
-    for pairs in (js.AllPairs(), js.NeighbourList(8, skin)):
+    for pairs in (js.fluid.AllPairs(), js.fluid.NeighbourList(8, skin)):
         # 0.3 skins in each step; so heavy that no collision limits the step.
         speeds = np.array([[12.0, 0.0], [-12.0, 0.0]])
-        system, state = make(points, 100.0, velocities=speeds, cutoff=js.PlainCutoff(2.5), pairs=pairs)
+        system, state = make(points, 100.0, velocities=speeds, cutoff=js.fluid.PlainCutoff(2.5), pairs=pairs)
         ends.append(js.rollout(system, state, js.VelocityVerlet(), 0.01, 2))
     assert int(ends[1].status.flags) == 0
     assert float(ends[0].state.velocity.x[0]) > 12.1
@@ -87,7 +86,7 @@ def test_forces_wherever_particles_are(gap):
     points = np.stack([gap * np.arange(40), np.zeros(40)], axis=1)
     points[39] = points[38] + [1.2, 0.0]
     for dim in (1, 2):
-        system, state = make(points[:, :dim], cutoff=js.PlainCutoff(2.5), pairs=js.NeighbourList(8, 0.5))
+        system, state = make(points[:, :dim], cutoff=js.fluid.PlainCutoff(2.5), pairs=js.fluid.NeighbourList(8, 0.5))
         force = components(system.force(state))
         np.testing.assert_allclose(force, slide_force(points[:, :dim], np.ones(40), reach=2.5), atol=1e-12)
         assert np.abs(force[38:]).max() > 0.1
@@ -115,7 +114,7 @@ def test_a_batch_of_fluids_is_each_alone(rng):
     def force(points, alpha):
         nonlocal n_traces
         n_traces += 1
-        fluid = js.Fluid(js.SlideLaw(alpha, 1.0, 0.1), cutoff=js.ShiftedForce(2.5), pairs=js.NeighbourList(64, 0.3))
+        fluid = js.Fluid(js.fluid.SlideLaw(alpha, 1.0, 0.1), cutoff=js.fluid.ShiftedForce(2.5), pairs=js.fluid.NeighbourList(64, 0.3))
         return js.System(net, 1.0, fluid).force(js.State.from_points(net, points))
 
     alpha = jnp.array([0.8, 1.0, 1.3])
@@ -124,7 +123,7 @@ def test_a_batch_of_fluids_is_each_alone(rng):
     together(jnp.asarray(points) + 0.1, alpha)
     assert n_traces == 1
     for lane in range(3):
-        alone, state = make(points[lane], law=js.SlideLaw(alpha[lane], 1.0, 0.1), cutoff=js.ShiftedForce(2.5))
+        alone, state = make(points[lane], law=js.fluid.SlideLaw(alpha[lane], 1.0, 0.1), cutoff=js.fluid.ShiftedForce(2.5))
         ours = np.stack([a[lane] for a in lanes], axis=-1)
         np.testing.assert_allclose(ours, components(alone.force(state)), rtol=1e-11, atol=1e-11)
 
@@ -132,8 +131,8 @@ def test_a_batch_of_fluids_is_each_alone(rng):
 def crystal(rng, cutoff=2.5, capacity=60):
     """A Lennard-Jones system with a list, and points on a lattice."""
     grid = np.stack(np.meshgrid(*[np.arange(4) * 1.2] * 3), axis=-1).reshape(-1, 3) + rng.normal(0, 0.03, (64, 3))
-    law, reach = js.LennardJones(1.0, 1.0), js.PlainCutoff(cutoff)
-    return make(grid, law=law, cutoff=reach, pairs=js.NeighbourList(capacity, 0.3))
+    law, reach = js.fluid.LennardJones(1.0, 1.0), js.fluid.PlainCutoff(cutoff)
+    return make(grid, law=law, cutoff=reach, pairs=js.fluid.NeighbourList(capacity, 0.3))
 
 
 def moved_points(state, points):
@@ -181,9 +180,9 @@ def test_a_list_that_serves_is_kept(rng):
 def test_a_pair_pushed_together_within_a_step(rng):
     """Two particles that a load brings within reach in one step: as with all pairs, though the step before was too short to tell."""
     ends = []
-    for pairs in (js.AllPairs(), js.NeighbourList(4, 0.3)):
+    for pairs in (js.fluid.AllPairs(), js.fluid.NeighbourList(4, 0.3)):
         points = np.array([[0.0, 0.0], [2.8001, 0.0]])
-        system, state = make(points, law=js.LennardJones(1.0, 1.0), cutoff=js.PlainCutoff(2.5), pairs=pairs)
+        system, state = make(points, law=js.fluid.LennardJones(1.0, 1.0), cutoff=js.fluid.PlainCutoff(2.5), pairs=pairs)
         push = js.Load.from_points(system.net, [[0.04, 0.0], [-0.04, 0.0]])
         system = js.System(system.net, 1.0, (*system.forces, push))
         ends.append(js.rollout(system, state, js.VelocityVerlet(), 1.0, 3).state.velocities)
@@ -196,12 +195,12 @@ def test_a_pair_pushed_together_within_a_step(rng):
 def test_solvers_of_diffrax_with_a_list(n_steps):
     """Two particles that meet: as with all pairs, from a state with a list and from one without."""
     ends = []
-    for pairs in (js.AllPairs(), js.NeighbourList(4, 0.3)):
+    for pairs in (js.fluid.AllPairs(), js.fluid.NeighbourList(4, 0.3)):
         system, state = make(
             np.array([[-3.0, 0.0], [3.0, 0.2]]),
-            law=js.LennardJones(1.0, 1.0),
+            law=js.fluid.LennardJones(1.0, 1.0),
             velocities=np.array([[1.0, 0.0], [-1.0, 0.0]]),
-            cutoff=js.PlainCutoff(2.5),
+            cutoff=js.fluid.PlainCutoff(2.5),
             pairs=pairs,
         )
         start = state if n_steps == 0 else js.rollout(system, state, js.VelocityVerlet(), 0.005, n_steps).state

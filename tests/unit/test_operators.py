@@ -79,7 +79,7 @@ def test_periods_do_not_wrap_a_velocity():
     """On a torus a product takes differences of velocities as they are, however large."""
     net = js.lattice((4,), periodic=True, box=[4.0])
     state = js.State.from_points(net, net.grid())
-    ones = js.EdgeField(tuple(jnp.ones(shape) for shape in net.family_shapes))
+    ones = js.topology.EdgeField(tuple(jnp.ones(shape) for shape in net.family_shapes))
     made = SpringMatrix(Blocks(springs=(SpringBlocks(net, ones),)), (None,), state.position, state.layout)
     out = made(js.Vector((jnp.array([0.0, 100.0, 0.0, 0.0]),)))
     np.testing.assert_array_equal(out.x, [-100.0, 200.0, -100.0, 0.0])

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import jaxspring as js
-from jaxspring.forces.base import Step
 
 CHAIN = js.lattice(5)
 SHEET = js.lattice((4, 5), js.STRUCTURAL + js.SHEAR)
@@ -20,7 +19,7 @@ def warm(net, temperature, scale=1.0, **more):
 
 def stiffness_at(theta, sharpness=None):
     net = js.lattice(2)
-    rule = js.ThermalStiffness(80.0, 300.0, 400.0, sharpness)
+    rule = js.thermal.ThermalStiffness(80.0, 300.0, 400.0, sharpness)
     return float(net.flatten(rule.stiffness(net, warm(net, theta)))[0])
 
 
@@ -43,13 +42,13 @@ def test_the_smooth_ramp_tends_to_the_hard_one():
 def test_mean_of_the_ends():
     """A spring between 300 K and 400 K is as one at 350 K."""
     net = js.lattice(2)
-    rule = js.ThermalStiffness(80.0, 300.0, 400.0)
+    rule = js.thermal.ThermalStiffness(80.0, 300.0, 400.0)
     assert float(net.flatten(rule.stiffness(net, warm(net, [300.0, 400.0])))[0]) == pytest.approx(40)
 
 
 def test_expansion():
     """A free chain heated by 100 K is at rest when longer by a * 100 K: no force there, and the closed form before it."""
-    springs = js.Springs(CHAIN, 7.0, 1.0, expansion=js.ThermalExpansion(2e-3, 300.0))
+    springs = js.Springs(CHAIN, 7.0, 1.0, expansion=js.thermal.ThermalExpansion(2e-3, 300.0))
     at_rest = js.System(CHAIN, 1.0, springs).force(warm(CHAIN, 400.0, 1.2))
     np.testing.assert_allclose(at_rest.x, 0, atol=1e-14)
     squeezed = js.System(CHAIN, 1.0, springs).force(warm(CHAIN, 400.0))
@@ -58,7 +57,7 @@ def test_expansion():
 
 def test_expansion_stops_at_nothing():
     """Cooled below -1 / a a rest length is zero, never less: the springs pull their ends together, and no further."""
-    springs = js.Springs(CHAIN, 7.0, 1.0, expansion=js.ThermalExpansion(2e-2, 300.0))
+    springs = js.Springs(CHAIN, 7.0, 1.0, expansion=js.thermal.ThermalExpansion(2e-2, 300.0))
     cold = warm(CHAIN, 200.0)
     np.testing.assert_array_equal(CHAIN.flatten(springs.natural_length(cold)), 0)
     np.testing.assert_allclose(springs.force(cold).x, [7, 0, 0, 0, -7], atol=1e-14)
@@ -68,7 +67,7 @@ def test_springs_with_thermal_stiffness_have_an_energy():
     """Minus the gradient of the energy by position is the force, at any temperature."""
     import jax
 
-    springs = js.Springs(SHEET, js.ThermalStiffness(80.0, 300.0, 400.0), 0.9)
+    springs = js.Springs(SHEET, js.thermal.ThermalStiffness(80.0, 300.0, 400.0), 0.9)
     state = warm(SHEET, np.linspace(280.0, 420.0, 20))
     slope = jax.grad(lambda x: springs.energy(state.moved(x, state.velocity)))(state.position)
     for a, b in zip(slope, springs.force(state), strict=True):
@@ -92,7 +91,7 @@ def test_fusing_breaks_for_good():
 
 def test_refreezing_takes_the_present_length():
     """What comes back has no pull and no energy; within the hysteresis, or out of reach, nothing comes back."""
-    again = js.Refreezing(hysteresis=20.0, reach=1.5)
+    again = js.thermal.Refreezing(hysteresis=20.0, reach=1.5)
     _, hot = fused([400.0] * 5, refreezing=again)
     assert not CHAIN.flatten(hot.alive).any()
     _, cool = fused([340.0] * 5, refreezing=again, state=hot)
@@ -102,13 +101,13 @@ def test_refreezing_takes_the_present_length():
     np.testing.assert_allclose(CHAIN.flatten(cold.rest_length), 1.3, rtol=1e-14)
     np.testing.assert_allclose(system.force(cold).x, 0, atol=1e-13)
     assert float(system.energy(cold).potential[0]) == pytest.approx(0, abs=1e-20)
-    _, far = fused([300.0] * 5, refreezing=js.Refreezing(20.0, reach=1.2), state=hot)
+    _, far = fused([300.0] * 5, refreezing=js.thermal.Refreezing(20.0, reach=1.2), state=hot)
     assert not CHAIN.flatten(far.alive).any()
 
 
 def test_refreezing_without_hysteresis():
     """At the melting point itself a spring stays broken; a hair below it comes back."""
-    again = js.Refreezing(hysteresis=0.0, reach=2.0)
+    again = js.thermal.Refreezing(hysteresis=0.0, reach=2.0)
     _, hot = fused([400.0] * 5, refreezing=again)
     _, end = fused([350.0, 350.0, 350.0, 349.99, 349.99], refreezing=again, state=hot)
     assert CHAIN.flatten(end.alive).tolist() == [False, False, True, True]
@@ -116,8 +115,8 @@ def test_refreezing_without_hysteresis():
 
 def test_refreezing_under_expansion():
     """What comes back while its material is cooler or warmer than the reference has no pull there, and the length of that temperature."""
-    springs = js.Springs(CHAIN, 10.0, 1.0, expansion=js.ThermalExpansion(2e-3, 400.0))
-    system = js.System(CHAIN, 1.0, springs, rules=js.Fusing(CHAIN, 350.0, js.Refreezing(20.0, 2.0)))
+    springs = js.Springs(CHAIN, 10.0, 1.0, expansion=js.thermal.ThermalExpansion(2e-3, 400.0))
+    system = js.System(CHAIN, 1.0, springs, rules=js.Fusing(CHAIN, 350.0, js.thermal.Refreezing(20.0, 2.0)))
     hot = js.rollout(system, warm(CHAIN, 400.0, 1.3), js.Still(), 0.1, 1).state
     cold = js.rollout(system, dataclasses.replace(hot, temperature=jnp.full(5, 300.0)), js.Still(), 0.1, 1).state
     assert CHAIN.flatten(cold.alive).all()
@@ -129,7 +128,7 @@ def test_a_melting_point_that_slipped_in_is_reported():
     """NaN put in after construction, by which nothing would ever melt, gives INVALID."""
     rule = eqx.tree_at(lambda r: r.melting, js.Fusing(CHAIN, 350.0), jnp.asarray(jnp.nan))
     state = rule.begin(warm(CHAIN, 400.0))
-    assert bool(rule.update(Step(state, state, jnp.asarray(0.1)), state)[1].has(js.Flag.INVALID))
+    assert bool(rule.update(js.Step(state, state, jnp.asarray(0.1)), state)[1].has(js.Flag.INVALID))
 
 
 def test_broken_springs_by_where():
@@ -142,16 +141,16 @@ def test_broken_springs_by_where():
 
 
 BARE = js.lattice((4, 5))
-WHOLE_SHEET = js.EdgeField(tuple(jnp.ones(shape, bool) for shape in SHEET.family_shapes))
+WHOLE_SHEET = js.topology.EdgeField(tuple(jnp.ones(shape, bool) for shape in SHEET.family_shapes))
 
 
 @pytest.mark.parametrize(
     ("make", "match"),
     [
-        (lambda: js.ThermalStiffness(-1.0, 300.0, 400.0), "stiffness"),
-        (lambda: js.ThermalStiffness(1.0, 400.0, 400.0), "not below melting"),
-        (lambda: js.ThermalStiffness(1.0, 300.0, 400.0, 0.0), "sharpness"),
-        (lambda: js.Refreezing(-1.0, 1.0), "hysteresis"),
+        (lambda: js.thermal.ThermalStiffness(-1.0, 300.0, 400.0), "stiffness"),
+        (lambda: js.thermal.ThermalStiffness(1.0, 400.0, 400.0), "not below melting"),
+        (lambda: js.thermal.ThermalStiffness(1.0, 300.0, 400.0, 0.0), "sharpness"),
+        (lambda: js.thermal.Refreezing(-1.0, 1.0), "hysteresis"),
         (lambda: js.Fusing(CHAIN, float("nan")), "melting"),
         (lambda: js.Floor((0.0, 0.0), (0.0, 0.0)), "no length"),
         (lambda: js.Floor((0.0, 0.0), (0.0, 1.0), friction=-0.1), "friction"),
@@ -193,7 +192,7 @@ def on_floor(velocity, friction=0.0, restitution=0.0, height=0.1):
     floor = js.Floor((0.0, 0.0), (0.0, 1.0), friction, restitution)
     before = js.State.from_points(net, [[0.0, height]], [velocity])
     moved = before.moved(before.position + 0.1 * before.velocity, before.velocity)
-    return after_floor(floor, Step(before, moved, jnp.asarray(0.1)), moved)[0]
+    return after_floor(floor, js.Step(before, moved, jnp.asarray(0.1)), moved)[0]
 
 
 def test_floor():
@@ -225,7 +224,7 @@ def test_floor_anywhere(rng):
     x, v = p + rng.normal(size=(6, 3)) * 0.1 + 0.5 * unit, 10 * rng.normal(size=(6, 3))
     before = js.State.from_points(net, x, v)
     moved = before.moved(before.position + 0.1 * before.velocity, before.velocity)
-    end, status = after_floor(js.Floor(p, n), Step(before, moved, jnp.asarray(0.1)), moved)
+    end, status = after_floor(js.Floor(p, n), js.Step(before, moved, jnp.asarray(0.1)), moved)
     flown = x + 0.1 * v
     height = (flown - p) @ unit
     assert 0 < (height < 0).sum() < 6
@@ -237,5 +236,5 @@ def test_floor_anywhere(rng):
 def test_a_floor_does_not_run_backward():
     """What a floor took is gone: a step back in time is INVALID."""
     state = js.State.from_points(CHAIN, CHAIN.grid())
-    status = after_floor(js.Floor((0.0,), (1.0,)), Step(state, state, jnp.asarray(-0.1)), state)[1]
+    status = after_floor(js.Floor((0.0,), (1.0,)), js.Step(state, state, jnp.asarray(-0.1)), state)[1]
     assert bool(status.has(js.Flag.INVALID))

@@ -24,11 +24,11 @@ NETS = {
     "block": lambda: js.lattice((3, 4, 3), springs=js.STRUCTURAL + js.SHEAR + js.BODY + js.BEND),
     "torus": lambda: js.lattice((5, 4), springs=js.STRUCTURAL + js.SHEAR, periodic=True, box=BOX),
     "tube": lambda: js.lattice((5, 4), springs=js.STRUCTURAL + js.SHEAR, periodic=(True, False), box=(0.0, 5.0)),
-    "gather": lambda: js.Graph.from_edges(random_edges(12, 30), 13, reduction=js.Gather),  # node 12 has no spring
-    "scatter": lambda: js.Graph.from_edges(random_edges(12, 30), 13, reduction=js.Scatter),
+    "gather": lambda: js.Graph.from_edges(random_edges(12, 30), 13, reduction=js.topology.Gather),  # node 12 has no spring
+    "scatter": lambda: js.Graph.from_edges(random_edges(12, 30), 13, reduction=js.topology.Scatter),
     "hub": lambda: js.Graph.from_edges([*random_edges(30, 90), *[(i % 29, 29) for i in range(40)]], 31),  # node 30 has no spring
-    "star": lambda: js.Graph.from_edges([(0, i) for i in range(1, 300)], 300, reduction=js.Gather),
-    "double": lambda: js.Graph.from_edges([(0, 1), (0, 1), (1, 0), (1, 2)], 3, reduction=js.Gather),
+    "star": lambda: js.Graph.from_edges([(0, i) for i in range(1, 300)], 300, reduction=js.topology.Gather),
+    "double": lambda: js.Graph.from_edges([(0, 1), (0, 1), (1, 0), (1, 2)], 3, reduction=js.topology.Gather),
     "single": lambda: js.lattice((1, 3)),
 }
 each_net = pytest.mark.parametrize("net", [make() for make in NETS.values()], ids=NETS.keys())
@@ -185,7 +185,8 @@ def test_gather_and_scatter_agree():
         return js.Springs(net, k, 0.5).energy(js.State.from_points(net, points))
 
     gather, scatter = (
-        jax.jit(jax.grad(lambda k, x, kind=kind: energy(k, x, kind), argnums=(0, 1)))(k, points) for kind in (js.Gather, js.Scatter)
+        jax.jit(jax.grad(lambda k, x, kind=kind: energy(k, x, kind), argnums=(0, 1)))(k, points)
+        for kind in (js.topology.Gather, js.topology.Scatter)
     )
     for a, b in zip(gather, scatter, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-12)
@@ -205,7 +206,7 @@ def test_tables_of_a_large_graph(rng):
     np.testing.assert_allclose(got, np.bincount(tail, p, 4000) - np.bincount(head, p, 4000), atol=1e-13)
 
 
-@pytest.mark.parametrize("reduction", [js.Gather, js.Scatter])
+@pytest.mark.parametrize("reduction", [js.topology.Gather, js.topology.Scatter])
 def test_two_springs_on_a_pair_add_up(reduction):
     """Two springs of 50 N/m between the same nodes pull as one of 100 N/m, to the bit; opposite directions to round-off."""
     points = np.array([[0.1, 0.2, 0.3], [1.3, 0.9, 0.2]])

@@ -58,7 +58,7 @@ def exact(points: np.ndarray) -> tuple[np.ndarray, int]:
 def begun(points: np.ndarray, speeds: np.ndarray) -> tuple[js.System, js.BoundSystem, js.State]:
     """The same fluid here, also bound, its list begun."""
     net = js.Graph.from_edges(np.zeros((0, 2), int), len(points))
-    fluid = js.Fluid(js.LennardJones(1.0, 1.0), js.ShiftedForce(REACH), js.NeighbourList(CAPACITY, SKIN))
+    fluid = js.Fluid(js.fluid.LennardJones(1.0, 1.0), js.fluid.ShiftedForce(REACH), js.fluid.NeighbourList(CAPACITY, SKIN))
     system = js.System(net, mass=1.0, forces=fluid)
     return system, system.bind(jnp.float32), eqx.filter_jit(lambda s: system.begin(s))(js.State.from_points(net, points, speeds))
 

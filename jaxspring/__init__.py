@@ -6,121 +6,7 @@ what experts choose is in `jaxspring.linalg`, `.images`, `.thermal`, `.fluid`, `
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
-
-from ._version import __version__
-
-_HOMES = {
-    "vector": ("Vector",),
-    "status": ("Flag", "SimulationError", "StabilityWarning", "Status", "raise_for_status"),
-    "state": ("State",),
-    "system": ("System",),
-    "bound": ("BoundSystem", "Energy"),
-    "nodes": ("Motion",),
-    "memory": ("Memory",),
-    "masses": ("lumped_mass",),
-    "edit": ("replace",),
-    "resume": ("Resume",),
-    "rollouts": ("Result", "rollout"),
-    "ode": ("OdeInfo", "OdeResult", "diffeqsolve"),
-    "blocks": ("Checkpointed", "StoreAll", "StoreStates"),
-    "watch": ("Solves",),
-    "progress": ("Progress",),
-    "files": ("load", "save", "save_trajectory"),
-    "export.vtk": ("save_vtk",),
-    "export.xyz": ("save_xyz",),
-    "export.ply": ("save_ply",),
-    "archive": ("CheckpointError",),
-    "plots": ("animate", "plot"),
-    "topology.edge_field": ("EdgeField",),
-    "topology.base": ("Topology",),
-    "topology.lattice": ("BEND", "BODY", "SHEAR", "STRUCTURAL", "Lattice", "lattice"),
-    "topology.graph": ("Graph",),
-    "topology.reduction": ("Gather", "Scatter"),
-    "topology.mesh_files": ("from_mesh",),
-    "topology.builders": ("delaunay", "from_networkx", "from_scipy", "from_triangles"),
-    "images.image": ("Image",),
-    "images.surface": ("Surface",),
-    "images.sampling": ("Bilinear", "CubicSpline", "Sampling"),
-    "images.smoothing": ("smooth", "smoothing_radius"),
-    "images.observation": (
-        "Combined",
-        "Curvature",
-        "GradientMagnitude",
-        "Intensity",
-        "Observation",
-        "adaptation",
-        "gradient_magnitude",
-        "principal_curvatures",
-    ),
-    "images.files": ("Channel", "ImageError", "Luminance", "elevation_model", "image_from_array", "load_image"),
-    "forces.base": ("Finding", "Force", "Rule", "Scene", "Step"),
-    "forces.linearisation": ("ExactTangent", "Linearisation", "Secant", "Tangent"),
-    "forces.laws": ("EnergyLaw", "Hooke", "Law", "PowerLaw", "PullLaw", "TensionOnly"),
-    "forces.springs": ("ExpansionRule", "Springs", "StiffnessRule"),
-    "forces.contact": ("Floor",),
-    "forces.adaptive": ("ImageStiffness",),
-    "forces.damping": ("Dashpots", "Drag"),
-    "forces.rayleigh": ("Rayleigh",),
-    "forces.loads": ("Gravity", "Load"),
-    "forces.data_springs": ("DataSprings", "ImageAttraction"),
-    "forces.pair_laws": ("LennardJones", "PairLaw", "SlideLaw", "UnitVectorLaw", "gentle_fluid"),
-    "forces.cutoffs": ("Cutoff", "NoCutoff", "PlainCutoff", "ShiftedForce", "Switched"),
-    "forces.pairs": ("AllPairs", "Pairs"),
-    "forces.neighbour_list": ("NeighbourList",),
-    "forces.pair_drag": ("PairDrag",),
-    "forces.molten": ("Molten",),
-    "forces.fluid": ("Fluid",),
-    "linalg.base": ("LinearSolver", "SolveInfo"),
-    "linalg.cg": ("CG", "JaxCG"),
-    "linalg.exact": ("ExactSolver",),
-    "linalg.lineax_solver": ("Lineax",),
-    "linalg.operators": ("Blocks", "NodeDyads", "SpringBlocks", "SpringMatrix"),
-    "linalg.multigrid": ("Multigrid",),
-    "linalg.preconditioners": ("BlockJacobi", "Jacobi", "Preconditioner", "Unpreconditioned"),
-    "linalg.envelope": ("Profile",),
-    "linalg.ordering": ("Natural", "Ordering", "ReverseCuthillMcKee"),
-    "linalg.skyline": ("Skyline", "SkylineFactor"),
-    "modes": ("Modes", "frequency_response", "normal_modes"),
-    "steppers.base": ("Stepper",),
-    "steppers.equilibrium": ("Equilibrium", "equilibrium"),
-    "steppers.explicit": ("ForwardEuler", "RungeKutta4", "SymplecticEuler", "VelocityVerlet"),
-    "steppers.implicit": ("BDF2", "BackwardEuler", "ImplicitMidpoint"),
-    "steppers.newton": ("Newton",),
-    "steppers.semi_implicit": ("SemiImplicit",),
-    "steppers.stability": ("stable_dt",),
-    "steppers.still": ("Still",),
-    "thermal.backward": ("HeatIteration",),
-    "thermal.boundaries": ("Convection", "FixedTemperature", "HeatFlux", "Radiation", "ThermalBoundary"),
-    "thermal.cells": ("Cells", "EqualCells", "HalfCells", "capacities"),
-    "thermal.conduction": ("conductances", "link_conductances"),
-    "thermal.fusing": ("Fusing", "Refreezing", "melted_fraction"),
-    "thermal.heat": ("Heat", "total_heat"),
-    "thermal.hot_plane": ("HotPlane",),
-    "thermal.latent": ("LatentHeat",),
-    "thermal.ledger": ("Account", "Ledger", "energy_ledger"),
-    "thermal.schemes": ("BackwardEulerHeat", "CrankNicolsonHeat", "ExplicitHeat", "HeatScheme"),
-    "thermal.split": ("SplitHeat", "SymmetricSplitHeat"),
-    "thermal.stiffness": ("ThermalExpansion", "ThermalStiffness"),
-    "inverse.fit": ("Fit", "History", "Iteration", "fit"),
-    "inverse.determined": ("Undetermined",),
-    "inverse.iteration": ("GradientWarning",),
-    "inverse.optimisers": ("LBFGS", "Adam", "LeastSquares", "Optax", "Optimiser"),
-    "inverse.stopping": ("Stop", "StopReason"),
-    "inverse.transforms": ("Bounded", "Identity", "Positive", "SoftPositive", "Transform"),
-    "inverse.select": ("Selection", "select"),
-    "inverse.losses": ("squared_distance",),
-    "inverse.checkpoint": ("Checkpoint",),
-    "inverse.check": ("GradientCheck", "check_gradient"),
-    "scenes.reconstruction.scene": ("Reconstruction", "Relaxation"),
-    "scenes.reconstruction.pixels": ("PixelSprings",),
-    "scenes.reconstruction.fitting": ("Reconstructed", "SpringSettings", "fit_springs"),
-    "scenes.reconstruction.constants": ("ConstantsSettings", "fit_constants"),
-}
-_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
-
-__all__ = ["__version__", *sorted(_HOME_OF)]
+from typing import TYPE_CHECKING
 
 from ._lazy import face as _face
 from ._version import __version__ as __version__
@@ -162,12 +48,12 @@ if TYPE_CHECKING:  # written by `python -m tests.face`
     from .files import load as load
     from .files import save as save
     from .files import save_trajectory as save_trajectory
-    from .export.vtk import save_vtk as save_vtk
-    from .export.xyz import save_xyz as save_xyz
-    from .export.ply import save_ply as save_ply
     from .archive import CheckpointError as CheckpointError
     from .plots import animate as animate
     from .plots import plot as plot
+    from .export.vtk import save_vtk as save_vtk
+    from .export.xyz import save_xyz as save_xyz
+    from .export.ply import save_ply as save_ply
     from .topology.lattice import BEND as BEND
     from .topology.lattice import BODY as BODY
     from .topology.lattice import SHEAR as SHEAR
@@ -187,10 +73,6 @@ if TYPE_CHECKING:  # written by `python -m tests.face`
     from .forces.base import Rule as Rule
     from .forces.base import Scene as Scene
     from .forces.base import Step as Step
-    from .forces.linearisation import ExactTangent as ExactTangent
-    from .forces.linearisation import Linearisation as Linearisation
-    from .forces.linearisation import Secant as Secant
-    from .forces.linearisation import Tangent as Tangent
     from .forces.laws import EnergyLaw as EnergyLaw
     from .forces.laws import Hooke as Hooke
     from .forces.laws import Law as Law

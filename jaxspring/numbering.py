@@ -63,14 +63,14 @@ def _edge_field(field: EdgeField, reorder: Reorder) -> EdgeField:
     permutation = None if field.identity is None else field.identity.order
     if permutation is None:
         return field
-    families = jax.tree.map(lambda a: _moved(permutation, a, reorder), field.families)
+    families = jax.tree.map(lambda a, p=permutation: _moved(p, a, reorder), field.families)
     return eqx.tree_at(lambda f: f.families, field, families)
 
 
 def _with_fields(thing: Any, names: tuple[str, ...], permutation: Permutation | None, reorder: Reorder) -> Any:
     if permutation is None:
         return thing
-    values = [jax.tree.map(lambda a: _moved(permutation, a, reorder), getattr(thing, name)) for name in names]
+    values = [jax.tree.map(lambda a, p=permutation: _moved(p, a, reorder), getattr(thing, name)) for name in names]
     return eqx.tree_at(lambda t: [getattr(t, name) for name in names], thing, values, is_leaf=lambda a: a is None or isinstance(a, Vector))
 
 

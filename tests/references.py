@@ -15,8 +15,7 @@ from dataclasses import dataclass
 
 import jax
 
-import jaxspring
-from tests import docstrings, markdown, source
+from tests import docstrings, face, markdown, source
 
 # Packages whose names the text uses, by what they are called there.
 FOREIGN = {
@@ -167,7 +166,7 @@ def known() -> frozenset[str]:
     """Names that are known everywhere: of the library's files, functions, classes, constants, their members and parameters, of Python, and
     of the packages that it stands on.
     """
-    found = {*dir(builtins), *keyword.kwlist, *jaxspring.__all__, *FOREIGN, *extras(), *dir(jax.Array), "js", "jaxspring"}
+    found = {*dir(builtins), *keyword.kwlist, *face.public(), *FOREIGN, *extras(), *dir(jax.Array), "js", "jaxspring"}
     found |= {name.lower() for name in classes()}  # a thing of that class
     for name, tree in modules().items():
         if name.startswith("jaxspring"):
@@ -267,9 +266,11 @@ def has_name(dotted: str, near: frozenset[str]) -> bool:
         return head in near or head in known()
     if head in FOREIGN:
         return is_foreign(dotted)
-    if head in ("js", "jaxspring") and rest[0] in jaxspring.__all__:
-        head, *rest = rest
-        return not rest or rest[0] in members(head)
+    if head in ("js", "jaxspring") and rest[0] in (*face.SUBMODULES, *face.public()):
+        written = f"js.{'.'.join(rest[: 1 + (rest[0] in face.SUBMODULES)])}"
+        *_, last = rest if len(rest) == 1 else written.split(".")
+        after = rest[written.count(".") :]
+        return written in face.written_as() and (not after or after[0] in members(last))
     if any(is_in_module(name, dotted) for name in modules()):
         return True
     if head in classes():

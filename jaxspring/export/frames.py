@@ -17,7 +17,7 @@ from .._checks import triangle_indices
 from ..numerics import is_traced
 from ..state import State
 from ..topology.base import Topology
-from ..topology.edge_field import EdgeField
+from ..topology.edge_field import EdgeField, fields_of
 from ..topology.periods import box_of
 
 if TYPE_CHECKING:
@@ -213,11 +213,11 @@ def _padded(vectors: np.ndarray) -> np.ndarray:
 
 def _alive(net: Topology, state: State, n_frames: int, is_series: bool) -> np.ndarray | None:
     """(F, E), or None where the state tells nothing of this net's springs."""
-    alive = state.alive
-    if alive is None or not net.n_springs:
+    first = jax.tree.map(lambda a: a[0], state) if is_series else state
+    if first.alive_of(net) is None or not net.n_springs:
         return None
-    if not net.owns(jax.tree.map(lambda a: a[0], alive) if is_series else alive):
-        return None
+    place = next(i for i, field in enumerate(fields_of(first.alive)) if net.owns(field))
+    alive = fields_of(state.alive)[place]
     flat = np.asarray(jax.vmap(net.flatten)(alive) if is_series else net.flatten(alive))
     return np.broadcast_to(flat, (n_frames, net.n_springs))
 

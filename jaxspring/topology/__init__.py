@@ -9,6 +9,7 @@ from .._lazy import face as _face
 if TYPE_CHECKING:  # written by `python -m tests.face`
     from .edge_field import EdgeField as EdgeField
     from .base import Topology as Topology
+    from .overlay import Overlay as Overlay
     from .reduction import Gather as Gather
     from .reduction import Scatter as Scatter
     from .lattice import BEND as BEND

@@ -73,7 +73,8 @@ class Overlay(Topology):
         near = locality_order(local, len(touched))
         inner = np.argsort(near)[local]
         springs = Permutation(np.lexsort((inner.max(axis=1), inner.min(axis=1))))
-        reduction, order = choose_reduction(len(touched)).build(*inner[springs.order].T, len(touched))
+        tails, heads = inner[springs.order].T
+        reduction, order = choose_reduction(len(touched)).build(tails, heads, len(touched))
         to_inner = np.argsort(near[order])
         where = touched[near[order]].astype(np.int32)
         back = np.full(count, len(touched), np.int32)

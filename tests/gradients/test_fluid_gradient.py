@@ -16,7 +16,7 @@ CHOICES = pytest.mark.parametrize("pairs", [js.fluid.AllPairs(tile=5), js.fluid.
 
 def fluid_of(pairs, rng, n=20):
     """A short-ranged fluid with its list begun, a direction to move in and one to weigh the forces with."""
-    system, state = make(blob(rng, n), rng.uniform(0.5, 2, n), cutoff=js.ShiftedForce(2.5), pairs=pairs)
+    system, state = make(blob(rng, n), rng.uniform(0.5, 2, n), cutoff=js.fluid.ShiftedForce(2.5), pairs=pairs)
     along, weights = (js.Vector(tuple(jnp.asarray(rng.normal(size=n)) for _ in range(3))) for _ in range(2))
     return system.bind(state.dtype), jax.jit(lambda s: system.begin(s))(state), along, weights
 
@@ -93,8 +93,8 @@ def test_derivatives_by_everything(pairs, rng):
 
     def force(at):
         position, velocity, mass, alpha, zeta, damping, radius = at
-        drag, law = js.PairDrag(damping, radius), js.SlideLaw(alpha, 1.0, zeta)
-        fluid = js.Fluid(law, js.ShiftedForce(2.5), pairs, drag, molten=js.Molten(net))
+        drag, law = js.fluid.PairDrag(damping, radius), js.fluid.SlideLaw(alpha, 1.0, zeta)
+        fluid = js.Fluid(law, js.fluid.ShiftedForce(2.5), pairs, drag, molten=js.fluid.Molten(net))
         system = js.System(net, mass, fluid)
         return system.force(system.begin(start.moved(position, velocity)))
 

@@ -112,7 +112,7 @@ def test_c9_a_free_chain_at_rest(solver):
     net = js.lattice(10)
     start = js.State.from_points(net, net.grid())
     system = js.System(net, 1.0, js.Springs(net, 1.0, 1.0)).bind(start.dtype)
-    matrix = system.matrix(system.stiffness_blocks(start, js.Tangent()), start)
+    matrix = system.matrix(system.stiffness_blocks(start, js.steppers.Tangent()), start)
 
     def solve(f):
         return solver.solve_in_step(matrix, js.Vector((jnp.asarray(f),)), None, None)[:2]

@@ -165,7 +165,7 @@ def test_g7_a_list_too_small_says_what_it_needs(rng):
     assert counted >= needed
     everyone, _ = make(points, cutoff=cut)
     np.testing.assert_allclose(components(system.force(state)), components(everyone.force(state)), rtol=1e-12, atol=1e-12)
-    enough, _ = make(points, cutoff=cut, pairs=js.NeighbourList(capacity=int(counted), skin=0.3))
+    enough, _ = make(points, cutoff=cut, pairs=js.fluid.NeighbourList(capacity=int(counted), skin=0.3))
     assert found(enough, enough.bind(state.dtype).begin(state))[OVERFLOW] == 0
 
 

@@ -59,7 +59,7 @@ def test_the_equilibrium_distance_can_be_differentiated():
 
 def test_gentle_fluid_rests_at_the_spacing():
     """beta = alpha h^4 / (h + zeta)^2 puts r_0 at h: a particle freed beside its neighbour feels nothing."""
-    law = js.gentle_fluid(spacing=0.37, zeta=0.05, alpha=2.5)
+    law = js.fluid.gentle_fluid(spacing=0.37, zeta=0.05, alpha=2.5)
     assert float(law.equilibrium_distance) == pytest.approx(0.37, rel=1e-14)
     assert float(law.alpha) == 2.5
 

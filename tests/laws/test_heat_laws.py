@@ -125,8 +125,8 @@ def test_what_a_melting_step_minimises_falls(rng):
 
     @jax.jit
     def both(c, g, t0, y, latent, dt, dtheta, loss):
-        cooling = js.Convection(NET, np.ones(12, bool), loss, 300.0, 1.0)
-        heat = js.Heat(NET, c, g, boundaries=cooling, latent=js.LatentHeat(350.0, latent)).ready(y.dtype)
+        cooling = js.thermal.Convection(NET, np.ones(12, bool), loss, 300.0, 1.0)
+        heat = js.Heat(NET, c, g, boundaries=cooling, latent=js.thermal.LatentHeat(350.0, latent)).ready(y.dtype)
         flow = heat.flow(js.State.from_points(NET, NET.grid(), temperature=y), cuts=False)
         equation = Equation(flow, flow.entered(t0, None), dt, jnp.ones(()))
         found = searched(equation, equation.matrix(y), y, equation.missing(y), dtheta)

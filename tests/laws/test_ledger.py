@@ -12,8 +12,8 @@ GROUND, UP = (0.0, 0.0), (0.0, 1.0)
 def melting_sheet(dt, duration=0.4):
     """A stretched sheet with weight and drag that is heated from below until its lower springs fuse, over a floor."""
     along = js.lattice((3, 4))
-    forces = (js.Springs(NET, js.ThermalStiffness(40.0, 310.0, 350.0), 0.9), js.Gravity((0.0, -6.0)), js.Drag(0.3))
-    heat = js.Heat(along, 1.0, 1.0, boundaries=js.HotPlane(GROUND, UP, 500.0, 6.0, 1.0, reach=0.5))
+    forces = (js.Springs(NET, js.thermal.ThermalStiffness(40.0, 310.0, 350.0), 0.9), js.Gravity((0.0, -6.0)), js.Drag(0.3))
+    heat = js.Heat(along, 1.0, 1.0, boundaries=js.thermal.HotPlane(GROUND, UP, 500.0, 6.0, 1.0, reach=0.5))
     system = js.System(NET, 1.0, forces, rules=(js.Ledger(), heat, js.Fusing(NET, 350.0), js.Floor(GROUND, UP, 0.2)))
     start = js.State.from_points(NET, NET.grid() + np.array([0.0, 0.02]), temperature=300.0)
     run = js.rollout(system, start, js.SymplecticEuler(), dt, round(duration / dt))
@@ -131,7 +131,7 @@ def test_a_ledger_changes_nothing():
     for has_books in (True, False):
         heat = js.Heat(js.lattice((3, 4)), 1.0, 1.0, boundaries=js.thermal.HotPlane(GROUND, UP, 500.0, 6.0, 1.0, reach=0.5))
         rules = (heat, js.Fusing(NET, 350.0), js.Floor(GROUND, UP, 0.2))
-        forces = (js.Springs(NET, js.ThermalStiffness(40.0, 310.0, 350.0), 0.9), js.Gravity((0.0, -6.0)))
+        forces = (js.Springs(NET, js.thermal.ThermalStiffness(40.0, 310.0, 350.0), 0.9), js.Gravity((0.0, -6.0)))
         system = js.System(NET, 1.0, forces, rules=(js.Ledger(), *rules) if has_books else rules)
         # Every step: in another order springs would fuse one step later.
         frames[has_books] = js.rollout(system, start, js.SymplecticEuler(), 2e-3, 200, save_every=1, observe=seen).saved
@@ -147,7 +147,7 @@ def seen(state):
 def molten_pair(rule, drag=None, dt=1e-3, n_steps=1):
     """Two free particles and one on a spring that is heated above 350 K at once; the books, the system and the end."""
     net = js.Graph.from_edges(np.array([[2, 3]]), 4)
-    fluid = js.Fluid(js.SlideLaw(1.0, 1.0), drag=drag, molten=js.Molten(net))
+    fluid = js.Fluid(js.fluid.SlideLaw(1.0, 1.0), drag=drag, molten=js.fluid.Molten(net))
     system = js.System(net, 1.0, (js.Springs(net, 10.0, 1.0), fluid), rules=(rule(net), js.Ledger()))
     points = [[0.0, 0.0], [1.3, 0.0], [0.0, 0.8], [1.3, 0.9]]
     start = js.State.from_points(net, points, [[0.5, 0], [-0.5, 0], [0, 0.3], [0, 0]], temperature=400.0)

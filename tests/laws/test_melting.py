@@ -159,8 +159,8 @@ def test_temperature_and_enthalpy_are_one_variable(seed, melting, log_latent, lo
 
 def scene(latent, conductance):
     """An insulated sheet that softens, melts and tears while it swings, with a book of its energy."""
-    heat = js.Heat(ALONG, 1.0, conductance, latent=js.LatentHeat(MELTING, latent), cut_by=NET)
-    springs = js.Springs(NET, js.ThermalStiffness(FULL, 320.0, 370.0), NET.lengths(NET.grid()))
+    heat = js.Heat(ALONG, 1.0, conductance, latent=js.thermal.LatentHeat(MELTING, latent), cut_by=NET)
+    springs = js.Springs(NET, js.thermal.ThermalStiffness(FULL, 320.0, 370.0), NET.lengths(NET.grid()))
     return js.System(NET, 1.0, (springs, js.Drag(0.3)), rules=(heat, js.Fusing(NET, MELTING), js.Ledger()))
 
 

@@ -18,7 +18,7 @@ START = js.State.from_points(PAIR, [[0.0], [2.0]], [[0.0], [-0.1]])
 class Fading(js.Force):
     """A Maxwell element of rest length 1: the damper's stretch q follows, dq/dt = (r - 1 - q) / tau."""
 
-    net: js.Topology
+    net: js.topology.Topology
     stiffness: jax.Array
     tau: jax.Array
 

@@ -108,7 +108,7 @@ def test_energy_of_a_mixed_pair_is_the_work_of_its_repulsion(r):
     core = 0.2
     net = js.Graph.from_edges(np.array([[1, 2]]), 3)
     # The solid particle's partner is far away, but no pair: both hang on one spring.
-    fluid = js.System(net, 1.0, js.Fluid(js.SlideLaw(1.0, 1.0), core=core, molten=js.Molten(net))).bind(float).forces[0]
+    fluid = js.System(net, 1.0, js.Fluid(js.fluid.SlideLaw(1.0, 1.0), core=core, molten=js.fluid.Molten(net))).bind(float).forces[0]
     state = js.State.from_points(net, [[0.0, 0.0], [r, 0.0], [99.0, 0.0]])
 
     def push(s):
@@ -148,7 +148,7 @@ def test_what_is_solid_drags_counts_and_limits_nothing():
 def test_bound_of_stiffness_of_a_mixed_pair():
     """Two particles, one fluid: twice the stiffness of the repulsion where it acts, zero beyond r_0."""
     net = js.Graph.from_edges(np.array([[1, 2]]), 3)
-    fluid = js.System(net, 1.0, js.Fluid(js.SlideLaw(1.0, 1.0), molten=js.Molten(net))).bind(float).forces[0]
+    fluid = js.System(net, 1.0, js.Fluid(js.fluid.SlideLaw(1.0, 1.0), molten=js.fluid.Molten(net))).bind(float).forces[0]
     for r, k in ((0.8, 3 / 0.8**4 - 1 / 0.8**2), (1.5, 0.0)):
         bound = fluid.stiffness_bound(js.State.from_points(net, [[0.0, 0.0], [r, 0.0], [99.0, 0.0]]))
         np.testing.assert_allclose(net.flatten_nodes(bound), [2 * k, 2 * k, 0], rtol=1e-12)
@@ -156,7 +156,7 @@ def test_bound_of_stiffness_of_a_mixed_pair():
 
 def test_no_pair_is_evaluated_before_something_melts():
     """The law is called for no tile while every spring is alive, and for each once one particle is free; so in a batch of scenes."""
-    net, system, state = scene(CountedLaw(1.0, 1.0), pairs=js.AllPairs(tile=2))
+    net, system, state = scene(CountedLaw(1.0, 1.0), pairs=js.fluid.AllPairs(tile=2))
     fluid = system.bind(state.dtype).forces[1]
     force = jax.jit(lambda state: fluid.force(state))
 
@@ -193,7 +193,7 @@ def test_a_run_goes_through_no_pairs_before_something_melts():
     pass a step from when one particle of one run is free.
     """
     net = js.lattice(5)
-    fluid = js.Fluid(js.gentle_fluid(1.0), pairs=CountedPairs(), molten=js.Molten(net))
+    fluid = js.Fluid(js.fluid.gentle_fluid(1.0), pairs=CountedPairs(), molten=js.fluid.Molten(net))
     rules = (js.Heat(net, 1.0, 1.0), js.Fusing(net, 350.0), js.Ledger())
     system = js.System(net, 1.0, (js.Springs(net, 10.0, 1.0), fluid), rules=rules)
 

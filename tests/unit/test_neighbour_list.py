@@ -95,7 +95,7 @@ def test_forces_wherever_particles_are(gap):
 @pytest.mark.slow
 def test_every_step_tells_an_overflow(rng):
     """The step itself says NEIGHBOUR_OVERFLOW with the capacity that is needed, whatever the list holds when the run ends."""
-    system, state = make(blob(rng, 60, spacing=0.8), cutoff=js.ShiftedForce(2.5), pairs=js.NeighbourList(8, 0.3))
+    system, state = make(blob(rng, 60, spacing=0.8), cutoff=js.fluid.ShiftedForce(2.5), pairs=js.fluid.NeighbourList(8, 0.3))
     fluid = system.bind(state.dtype).forces[0]
     begun = system.begin(state)
     status = jax.jit(lambda state: fluid.update(Step(state, state, jnp.asarray(1e-6)), state)[1])(begun)

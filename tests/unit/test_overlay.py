@@ -11,7 +11,11 @@ import jaxspring as js
 
 RNG = np.random.default_rng(11)
 SQUARE = RNG.random((30, 2))
-BASES = {"lattice": js.lattice((5, 6)), "graph": js.delaunay(SQUARE), "scatter": js.Graph.from_edges([(0, 1)], 30, reduction=js.Scatter)}
+BASES = {
+    "lattice": js.lattice((5, 6)),
+    "graph": js.delaunay(SQUARE),
+    "scatter": js.Graph.from_edges([(0, 1)], 30, reduction=js.topology.Scatter),
+}
 SEAM = np.array([[0, 29], [7, 22], [29, 3]])
 MANY = np.array([p for p in RNG.integers(0, 30, (80, 2)) if p[0] != p[1]])
 
@@ -30,7 +34,7 @@ def scene(base, edges, points=None):
 @pytest.mark.parametrize("edges", [SEAM, MANY], ids=["seam", "many"])
 @pytest.mark.parametrize("base", BASES.values(), ids=BASES)
 def test_an_overlay_is_the_net_of_its_springs(base, edges):
-    """Forces, energies, lengths and edges are those of a graph of the same springs, whoever owns the nodes, and nodes beside it feel nothing."""
+    """Forces, energies, lengths and edges are those of a graph of the same springs; nodes beside it feel nothing."""
     (over, state), (alone, own) = scene(base, edges)
     np.testing.assert_array_equal(over.forces[0].net.edges, edges)
     for a, b in zip(over.force(state), alone.force(own), strict=True):
@@ -69,7 +73,7 @@ def test_implicit_steps_and_gradients(base, edges):
 class Snapping(js.Rule):
     """Springs of this net break beyond a length."""
 
-    net: js.Topology
+    net: js.topology.Topology
     longest: jax.Array
 
     def begin(self, state):

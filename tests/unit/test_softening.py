@@ -156,7 +156,7 @@ WHOLE_SHEET = js.topology.EdgeField(tuple(jnp.ones(shape, bool) for shape in SHE
         (lambda: js.Floor((0.0, 0.0), (0.0, 1.0), friction=-0.1), "friction"),
         (lambda: js.Floor((0.0, 0.0), (0.0, 1.0), restitution=1.5), "restitution"),
         (
-            lambda: js.System(CHAIN, 1.0, rules=js.Fusing(CHAIN, 1.0, js.Refreezing(1.0, 1.0))).bind(float),
+            lambda: js.System(CHAIN, 1.0, rules=js.Fusing(CHAIN, 1.0, js.thermal.Refreezing(1.0, 1.0))).bind(float),
             "one Springs on the net of Fusing, whose rest lengths change; this system has 0",
         ),
         (lambda: js.Fusing(CHAIN, 1.0).begin(dataclasses.replace(warm(CHAIN, 1.0), alive=WHOLE_SHEET)), "of another net than Fusing"),

@@ -185,8 +185,9 @@ BY_HAND = {"diffeqsolve", "fit", "check_gradient", "frequency_response", "from_n
 
 # What the library makes and hands out; nobody else builds it.
 MADE_INSIDE = """
-    Account Blocks Energy Equilibrium Finding Fit Gather GradientCheck History Iteration Modes NodeDyads OdeInfo OdeResult Profile
-    Result Resume Scatter Selection SkylineFactor SolveInfo Solves SpringBlocks SpringMatrix Status Step Surface Reconstructed
+    Account Blocks BoundSystem Energy Equilibrium Finding Fit Gather GradientCheck History Iteration Memory Modes NodeDyads OdeInfo OdeResult Overlay
+    Profile
+    Result Resume Scatter Scene Selection SkylineFactor SolveInfo Solves SpringBlocks SpringMatrix Status Step Surface Reconstructed
     Undetermined
 """
 

@@ -142,7 +142,8 @@ class BoundSystem(Nodes):
                 total = total.then(_placed(status, i))
                 stages += [] if isinstance(part, Force) else [(i, state)]
         if obstacles:
-            state, status, impacts = strike(tuple(part for _, part in obstacles), step, state, books=bool(watchers))
+            is_kicked = any(part.moves for _, part in followers if not part.is_obstacle)
+            state, status, impacts = strike(tuple(part for _, part in obstacles), step, state, bool(watchers), is_kicked)
             total = total.then(_placed(status, obstacles[0][0]))
             stages.append((-1, state))
         step = replace(step, stages=tuple(stages), impacts=impacts)

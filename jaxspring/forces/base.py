@@ -103,7 +103,7 @@ class Rule(eqx.Module):
     """What happens to a state after each step, besides motion. Abstract.
 
     Rules run in the order in which the system names them, each on the state that the one before left; then all obstacles, together; then
-    those that watch. A rule that gives the state another position or velocity tells the stepper so by that alone.
+    those that watch. A stepper is told where a rule may have changed positions or velocities (`moves`).
 
     What it must know from step to step it gives in `remember`, reads by `recall` and writes by `keep`.
 
@@ -111,12 +111,16 @@ class Rule(eqx.Module):
         is_obstacle: whether nodes meet it: all of a system's act together, the earliest impact first (class attribute).
         is_cache: whether what it remembers can be made anew from the state (class attribute).
         sets_temperature: whether it changes temperatures: it is named where one is NaN or infinite (class attribute).
+        moves: whether it may change positions or velocities (class attribute).
+        breaks: whether it may change which springs hold, or their rest lengths (class attribute).
         watches: whether it acts last, and is told by `Step.stages` what all the others did (class attribute).
         place: which part of its system it is, once bound: its index in a status and in `state.memory` (static).
     """
 
     is_obstacle: ClassVar[bool] = False
     is_cache: ClassVar[bool] = False
+    moves: ClassVar[bool] = True
+    breaks: ClassVar[bool] = True
     sets_temperature: ClassVar[bool] = False
     watches: ClassVar[bool] = False
     place: int | None = eqx.field(static=True, init=False, default=None)

@@ -51,6 +51,7 @@ class Floor(Rule):
     """
 
     is_obstacle: ClassVar[bool] = True
+    breaks: ClassVar[bool] = False
     point: Array
     normal: Array
     friction: Array
@@ -93,10 +94,17 @@ class Floor(Rule):
 Books = tuple[tuple[Array, ...], tuple[Vector, ...]]
 
 
-def strike(floors: tuple[Rule, ...], step: Step, state: State, books: bool = False) -> tuple[State, Status, Books | None]:
+def strike(
+    floors: tuple[Rule, ...], step: Step, state: State, books: bool = False, is_kicked: bool = True
+) -> tuple[State, Status, Books | None]:
     """The state after the impacts of a step on all these floors, whatever their order, and what went wrong.
 
-    With `books` also what each floor changed v^2 / 2 and v by, per node: node arrays and `Vector`s.
+    Args:
+        floors: all of them.
+        step: what is known of the step.
+        state: what the other rules left.
+        books: whether to tell what each floor changed v^2 / 2 and v by, per node: node arrays and `Vector`s.
+        is_kicked: whether another rule may have moved or kicked nodes since the end of motion.
 
     Raises:
         TypeError: an obstacle that is no `Floor`.
@@ -122,9 +130,8 @@ def strike(floors: tuple[Rule, ...], step: Step, state: State, books: bool = Fal
     any_meets = any_lane(jnp.any(scene.next_impact(path)[2]))
     position, velocity, (work, given), unfinished = lax.cond(any_meets, met, passed, path)
     # Another rule may have moved or kicked nodes since: then what the impacts change is added to that.
-    if state.position is not moved.position:
+    if is_kicked:
         position = state.position + (position - moved.position)
-    if state.velocity is not moved.velocity:
         velocity = state.velocity + (velocity - moved.velocity)
     status = Status.when(Flag.INVALID, step.dt < 0)
     if len(planes) > 1:

@@ -66,6 +66,8 @@ class Fluid(Force):
     """
 
     is_cache: ClassVar[bool] = True
+    moves: ClassVar[bool] = False
+    breaks: ClassVar[bool] = False
     law: PairLaw
     cutoff: Cutoff
     pairs: Pairs

@@ -11,6 +11,8 @@ Source: Terzopoulos, Platt and Fleischer (1989): a thermoelastic unit fuses abov
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
@@ -69,6 +71,7 @@ class Fusing(Rule):
     [ True False]
     """
 
+    moves: ClassVar[bool] = False
     net: Topology
     melting: Array
     refreezing: Refreezing | None

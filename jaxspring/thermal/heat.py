@@ -65,6 +65,8 @@ class Heat(Rule):
     """
 
     sets_temperature: ClassVar[bool] = True
+    moves: ClassVar[bool] = False
+    breaks: ClassVar[bool] = False
     net: Topology
     capacity: Array
     conductance: Any

@@ -72,6 +72,8 @@ class Ledger(Rule):
     """
 
     watches: ClassVar[bool] = True
+    moves: ClassVar[bool] = False
+    breaks: ClassVar[bool] = False
     forces: tuple[Force, ...] | None
     rules: tuple[Rule, ...] | None
     mass: Array | None
@@ -101,7 +103,8 @@ class Ledger(Rule):
         before = step.before
         stages, columns, places = [before, step.moved], [account.now, self.columns(step.moved)], [-1]
         for place, after in step.stages:
-            columns.append(self.columns(after, stages[-1], columns[-1]))
+            is_still = place >= 0 and not (self._parts()[1][place - n_forces].moves or self._parts()[1][place - n_forces].breaks)
+            columns.append(self.columns(after, columns[-1] if is_still else None))
             stages.append(after)
             places.append(place - n_forces if place >= 0 else -1)
         mean = 0.5 * (before.velocity + state.velocity)
@@ -131,17 +134,16 @@ class Ledger(Rule):
         """(2 + F,) what happened to the columns between two stages of a step: kicks at the mean velocity of the step [J]."""
         return (after - before).at[0].set(jnp.sum(self._mass(a) * (b.velocity - a.velocity).dot(mean)))
 
-    def columns(self, state: State, last: State | None = None, known: Array | None = None) -> Array:
+    def columns(self, state: State, known: Array | None = None) -> Array:
         """(2 + F,) kinetic energy, potential of each force (0 where there is none), heat [J].
 
-        `known` are the columns of the state `last`: a fluid whose particles are where they were is not summed again.
+        `known` are the columns of a state with the same particles in the same places: a fluid is then not summed again.
         """
         kinetic = 0.5 * jnp.sum(self._mass(state) * state.velocity.dot(state.velocity))
         zero = jnp.zeros((), state.dtype)
-        is_moved = last is None or known is None or last.position is not state.position or last.alive is not state.alive
         stored = []
         for i, force in enumerate(self._parts()[0]):
-            energy = force.energy(state) if is_moved or known is None or not isinstance(force, Fluid) else known[1 + i]
+            energy = force.energy(state) if known is None or not isinstance(force, Fluid) else known[1 + i]
             stored.append(zero if energy is None else energy)
         heat = sum((total_heat(r, state) for r in self._parts()[1] if isinstance(r, Heat)), start=zero)
         return jnp.stack([kinetic, *stored, heat])

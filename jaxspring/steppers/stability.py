@@ -44,7 +44,8 @@ def stable_dt(system: System, state: State, stepper: Stepper | None = None) -> A
     2.0
     """
     stepper = SymplecticEuler() if stepper is None else stepper
-    limit = dt_limit(as_system(system).bind(state.checked().dtype), state, stepper)
+    bound = as_system(system).bind(state.checked().dtype)
+    limit = dt_limit(bound, bound.own(state), stepper)
     if limit is None:
         raise TypeError(f"{type(stepper).__name__} has no known stability limit (its `limit` returns None).")
     return limit

@@ -21,6 +21,8 @@ from jaxtyping import Array
 
 # What a user may pass for numbers: a scalar, an array of any library, nested lists.
 Numbers: TypeAlias = "ArrayLike | Sequence[Numbers]"
+# And for the springs of a net: node numbers, (E, 2), or any series of pairs.
+Edges: TypeAlias = "Numbers | Iterable[Sequence[int]]"
 
 BUILD_OUTSIDE = "Build the net outside of jit, grad and vmap, and pass it in: one net is one program."
 

@@ -13,6 +13,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array
 
 from .forces.base import Force, Rule, Scene, Step, acts
@@ -66,7 +67,7 @@ class BoundSystem(Nodes):
     rules: tuple[Rule, ...] | None
 
     @staticmethod
-    def of(net: Topology, mass: Array, forces: Any, free: Free, motion: Motion | None, rules: Any, dtype: Any) -> BoundSystem:
+    def of(net: Topology, mass: Array, forces: Any, free: Free, motion: Motion | None, rules: Any, dtype: DTypeLike) -> BoundSystem:
         """The bound system of these parts, in this dtype."""
         net, mass, motion = cast_inexact((net, mass, motion), dtype)
         scene = Scene(net, mass, dtype, forces, rules or ())

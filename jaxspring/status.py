@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import enum
 import warnings
-from typing import Any
+from typing import Any, Protocol
 
 import equinox as eqx
 import jax
@@ -201,7 +201,16 @@ class StabilityWarning(UserWarning):
     """A simulation ended with a warning in its status, or is about to be run above its stability limit."""
 
 
-def raise_for_status(result: Any) -> None:
+class HasStatus(Protocol):
+    """A result: whatever has a status."""
+
+    @property
+    def status(self) -> Status:
+        """What went wrong, if anything."""
+        ...
+
+
+def raise_for_status(result: Status | HasStatus) -> None:
     """Raise `SimulationError` where `result` (or a `Status`) holds an error; warn where it holds a warning only.
 
     Inside `jit` a status is a traced value: return it and call this outside.

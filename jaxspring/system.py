@@ -13,6 +13,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array
 
 from . import printing
@@ -151,7 +152,7 @@ class System(Nodes):
         """Names of forces and rules, in the order of their indices in a status."""
         return tuple(type(part).__name__ for part in self.parts)
 
-    def bind(self, dtype: Any) -> BoundSystem:
+    def bind(self, dtype: DTypeLike) -> BoundSystem:
         """The system as a loop wants it: every constant in the shape of the topology and of `dtype`, every part knowing its masses, its
         place and the others. Made once, inside the program that runs.
 

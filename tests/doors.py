@@ -185,10 +185,9 @@ BY_HAND = {"diffeqsolve", "fit", "check_gradient", "frequency_response", "from_n
 
 # What the library makes and hands out; nobody else builds it.
 MADE_INSIDE = """
-    Account Blocks BoundSystem Energy Equilibrium Finding Fit Gather GradientCheck History Iteration Memory Modes NodeDyads OdeInfo OdeResult Overlay
-    Profile
-    Result Resume Scatter Scene Selection SkylineFactor SolveInfo Solves SpringBlocks SpringMatrix Status Step Surface Reconstructed
-    Undetermined
+    Account Blocks BoundSystem Energy Equilibrium Finding Fit Gather GradientCheck History Iteration Memory Modes NodeDyads
+    OdeInfo OdeResult Overlay Profile Reconstructed Result Resume Scatter Scene Selection SkylineFactor SolveInfo Solves
+    SpringBlocks SpringMatrix Status Step Surface Undetermined
 """
 
 # Objects made of options, other objects, functions or files: no array of the user's enters.

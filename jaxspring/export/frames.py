@@ -65,7 +65,7 @@ class Frames:
 
 
 def frames_of(
-    states: States, net: Topology, node_fields: NodeFields = None, spring_fields: SpringFields = None, triangles: Any = None
+    states: States, net: Topology, node_fields: NodeFields = None, spring_fields: SpringFields = None, triangles: Numbers | None = None
 ) -> Frames:
     """The states of a run, or one state, and the user's fields.
 

@@ -5,10 +5,9 @@ Source: G. Turk, The PLY Polygon File Format (1994); types as in http://paulbour
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
+from .._arrays import Numbers
 from ..archive import Path, atomic_file
 from ..topology.base import Topology
 from .frames import Frames, NodeFields, States, frames_of
@@ -22,7 +21,7 @@ def save_ply(
     states: States,
     net: Topology,
     node_fields: NodeFields = None,
-    triangles: Any = None,
+    triangles: Numbers | None = None,
 ) -> None:
     """Write a state, or the frames of a run, as PLY for MeshLab, Blender and other programs for meshes.
 

@@ -7,11 +7,11 @@ Source: VTK file formats, https://docs.vtk.org/en/latest/vtk_file_formats/index.
 from __future__ import annotations
 
 import base64
-from typing import Any
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from .._arrays import Numbers
 from ..archive import Path, atomic_file
 from ..topology.base import Topology
 from .frames import Frames, NodeFields, SpringFields, States, frames_of
@@ -27,7 +27,7 @@ def save_vtk(
     net: Topology,
     node_fields: NodeFields = None,
     spring_fields: SpringFields = None,
-    triangles: Any = None,
+    triangles: Numbers | None = None,
 ) -> None:
     """Write a state, or the frames of a run, for ParaView and other programs that read VTK's files.
 

@@ -19,6 +19,7 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array
 
 from .._arrays import Numbers, given
@@ -100,7 +101,7 @@ class ImageStiffness(StiffnessRule):
         """Which fields are made anew where another is replaced by a number: the filter's width follows sigma."""
         return {"sigma": ("radius",)}
 
-    def bind(self, net: Topology, dtype: Any) -> ImageStiffness:
+    def bind(self, net: Topology, dtype: DTypeLike) -> ImageStiffness:
         """The rule with its adaptation function made: once before a loop, not in every step."""
         ready = self.adaptation().surface(self.sampling) if self.adapted is None else self.adapted
         return cast_inexact(eqx.tree_at(lambda r: r.adapted, self, ready, is_leaf=lambda leaf: leaf is None), dtype)

@@ -16,6 +16,7 @@ from typing import Any, ClassVar, Self
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array
 
 from .. import printing
@@ -81,7 +82,7 @@ class Scene:
         rules: of the system, not bound.
     """
 
-    def __init__(self, net: Topology, mass: Array, dtype: Any, forces: tuple[Force, ...], rules: tuple[Rule, ...]):
+    def __init__(self, net: Topology, mass: Array, dtype: DTypeLike, forces: tuple[Force, ...], rules: tuple[Rule, ...]):
         self.net, self.mass, self.dtype, self.forces, self.rules = net, mass, dtype, forces, rules
         self._bound: dict[int, Any] = {}
 

@@ -15,6 +15,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array
 
 from .._arrays import whole_number
@@ -55,7 +56,7 @@ class StiffnessRule(eqx.Module):
         """Whether a constant has a value that the constructor would refuse."""
         return None
 
-    def bind(self, net: Topology, dtype: Any) -> StiffnessRule:
+    def bind(self, net: Topology, dtype: DTypeLike) -> StiffnessRule:
         """The rule as the loop wants it: constants cast, tables made. Called once, before the loop."""
         return cast_inexact(self, dtype)
 

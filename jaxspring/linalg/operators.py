@@ -76,7 +76,7 @@ class SpringBlocks(eqx.Module):
         along = self.net.map_springs(lambda s, u: s * u[i] * u[j], self.slope, self.direction)
         return self.weight + along if i == j else along
 
-    def scaled(self, factor: Any) -> SpringBlocks:
+    def scaled(self, factor: Array | float) -> SpringBlocks:
         """The same springs with every block times `factor`."""
         scaled = eqx.tree_at(lambda b: b.weight, self, self.weight * factor)
         return scaled if self.slope is None else eqx.tree_at(lambda b: b.slope, scaled, self.slope * factor)
@@ -97,7 +97,7 @@ class NodeDyads(eqx.Module):
         """s g (g . v)."""
         return (self.slope * self.direction.dot(v)) * self.direction
 
-    def scaled(self, factor: Any) -> NodeDyads:
+    def scaled(self, factor: Array | float) -> NodeDyads:
         """Every block times `factor`."""
         return NodeDyads(self.slope * factor, self.direction)
 
@@ -118,7 +118,7 @@ class Blocks(eqx.Module):
     def __add__(self, other: Blocks) -> Blocks:
         return Blocks(self.diagonal + other.diagonal, self.dyads + other.dyads, self.springs + other.springs)
 
-    def scaled(self, factor: Any) -> Blocks:
+    def scaled(self, factor: Array | float) -> Blocks:
         """Every block times `factor`."""
         return Blocks(
             tuple(factor * d for d in self.diagonal),

@@ -14,12 +14,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.typing import DTypeLike
 from jaxtyping import Array
 
 from ..bound import BoundSystem
@@ -266,7 +266,7 @@ class _Search(eqx.Module):
     def _has_energy(self, scene: _Scene) -> bool:
         return jax.eval_shape(scene.energy, scene.start.position) is not None
 
-    def tolerance_for(self, dtype: Any) -> float:
+    def tolerance_for(self, dtype: DTypeLike) -> float:
         """Net force over the size of the forces."""
         return self.tolerance or (1e-10 if dtype == jnp.float64 else 1e-5)
 

@@ -21,6 +21,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array
 
 from ..bound import BoundSystem
@@ -123,7 +124,7 @@ class ImplicitStepper(Stepper):
         """What stands for the states before the first one."""
         return None
 
-    def energy_slack(self, dtype: Any) -> float:
+    def energy_slack(self, dtype: DTypeLike) -> float:
         """Rise of the energy above its lowest that is not yet reported: a share of the scale of `EnergyWatch`.
 
         A single linear step stretches what turns, by the fourth order of the angle: a good run gains that in its first step.
@@ -217,7 +218,7 @@ class ImplicitMidpoint(ImplicitStepper):
         middle = stage.full(y)
         return state.moved(state.position + dt * middle, stage.system.hold(2 * middle - state.velocity), state.time + dt)
 
-    def energy_slack(self, dtype: Any) -> float:
+    def energy_slack(self, dtype: DTypeLike) -> float:
         """A fifth: the rule keeps a nearby energy, about which the true one swings."""
         return 0.2
 
@@ -267,7 +268,7 @@ class BDF2(ImplicitStepper):
         """The stage's state is the new state."""
         return stage.reached(y)
 
-    def energy_slack(self, dtype: Any) -> float:
+    def energy_slack(self, dtype: DTypeLike) -> float:
         """A tenth: what the method lets fall is a sum over two steps."""
         return 0.1
 

@@ -17,6 +17,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.typing import DTypeLike
 from jaxtyping import Array
 
 from .._arrays import Numbers
@@ -242,7 +243,7 @@ class Heat(Rule):
         """Capacity in node shape, conductance as an edge field."""
         return self.ready(scene.dtype)
 
-    def ready(self, dtype: Any) -> Heat:
+    def ready(self, dtype: DTypeLike) -> Heat:
         """The same, without a system: what `power`, `supplied` and `total_heat` read."""
         if self.place is not None:
             return self

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .. import printing
-from .._arrays import Numbers, own
+from .._arrays import Edges, Numbers, own
 from .._checks import as_inexact, finite, has_shape, shape_of
 from ..vector import Vector
 from .edge_field import EdgeField, SpringNumbers
@@ -149,7 +149,7 @@ class Topology(eqx.Module):
         return dataclasses.replace(self, name=name)
 
     @abc.abstractmethod
-    def with_edges(self, edges: Any, name: str | None = None) -> Topology:
+    def with_edges(self, edges: Edges, name: str | None = None) -> Topology:
         """A further net over the same nodes, with springs of its own: bending springs, a seam, another graph.
 
         Its springs have constants, damping and breaking of their own; what it costs grows with the nodes that it touches.

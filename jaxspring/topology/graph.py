@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from .._arrays import whole_number
+from .._arrays import Edges, Numbers, whole_number
 from .._checks import node_indices, triangle_indices
 from ..vector import Vector
 from .base import Topology
@@ -57,7 +57,12 @@ class Graph(Topology):
 
     @staticmethod
     def from_edges(
-        edges: Any, n_nodes: int, *, box: Any = None, triangles: Any = None, reduction: type[Gather] | type[Scatter] | None = None
+        edges: Edges,
+        n_nodes: int,
+        *,
+        box: Numbers | None = None,
+        triangles: Numbers | None = None,
+        reduction: type[Gather] | type[Scatter] | None = None,
     ) -> Graph:
         """A network from an (E, 2) integer array: tail and head node of each spring. Springs may be repeated.
 
@@ -138,7 +143,7 @@ class Graph(Topology):
         inner = np.stack([np.asarray(self.tails), np.asarray(self.heads)], axis=-1)
         return self.nodes.order[inner][self.springs.inverse]
 
-    def with_edges(self, edges: Any, name: str | None = None) -> Overlay:
+    def with_edges(self, edges: Edges, name: str | None = None) -> Overlay:
         """A further net over the same nodes: see `Topology.with_edges`."""
         return Overlay.on(self.layout, self.box, edges, name)
 

@@ -19,7 +19,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from .._arrays import Numbers, whole_number
+from .._arrays import Edges, Numbers, whole_number
 from .._checks import is_concrete
 from ..numerics import linear_call
 from ..vector import Vector
@@ -130,7 +130,7 @@ class Lattice(Topology):
             pairs.append(np.stack([numbers[tails].ravel(), heads[tails].ravel()], axis=-1))
         return np.concatenate(pairs).astype(np.int32) if pairs else np.zeros((0, 2), np.int32)
 
-    def with_edges(self, edges: Any, name: str | None = None) -> Overlay:
+    def with_edges(self, edges: Edges, name: str | None = None) -> Overlay:
         """A further net over the same nodes: see `Topology.with_edges`."""
         return Overlay.on(self.layout, self.box, edges, name)
 

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
+from .._arrays import Edges
 from .._checks import node_indices
 from ..numerics import linear_call
 from ..vector import Vector
@@ -61,7 +62,7 @@ class Overlay(Topology):
     name: str | None = eqx.field(static=True, default=None)
 
     @staticmethod
-    def on(nodes: NodeLayout, box: Array | None, edges: Any, name: str | None = None) -> Overlay:
+    def on(nodes: NodeLayout, box: Array | None, edges: Edges, name: str | None = None) -> Overlay:
         """A net of these springs over nodes that are stored like this; see `Topology.with_edges`."""
         count = math.prod(nodes.shape)
         pairs = node_indices("edges", edges, count)
@@ -127,7 +128,7 @@ class Overlay(Topology):
         users = places if self.node_permutation is None else self.node_permutation.order[places]
         return users[self.springs.inverse]
 
-    def with_edges(self, edges: Any, name: str | None = None) -> Overlay:
+    def with_edges(self, edges: Edges, name: str | None = None) -> Overlay:
         """A further net over the same nodes: see `Topology.with_edges`."""
         return Overlay.on(self.layout, self.box, edges, name)
 

@@ -12,9 +12,8 @@ stopped.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -23,11 +22,12 @@ from jaxtyping import Array
 
 from ...images.image import Image
 from ...inverse.checkpoint import Checkpoint
-from ...inverse.fit import fit
+from ...inverse.fit import Iteration, fit
 from ...inverse.optimisers import Adam
 from ...inverse.transforms import Positive
 from ...linalg.cg import JaxCG
 from ...numerics import stopped
+from ...progress import Progress
 from ...rollouts import rollout
 from ...state import State
 from ...steppers.explicit import SymplecticEuler
@@ -165,10 +165,10 @@ def fit_constants(
     image: Image,
     names: Sequence[str],
     settings: ConstantsSettings | None = None,
-    on_iteration: Any = None,
+    on_iteration: Callable[[Iteration], bool | None] | None = None,
     checkpoint: Checkpoint | None = None,
     resume: bool = False,
-    progress: Any = None,
+    progress: Progress | None = None,
 ) -> Reconstructed:
     """Fit some of `NAMES` through the rollout, each kept positive; `result.fit.parameters` has them by name.
 

@@ -137,10 +137,9 @@ def diffeqsolve(
     """
     import diffrax
 
-    system = as_system(system)
     _check_options(solver, saveat, stepsize_controller, adjoint, progress_meter, max_steps, event)
     _check_times(state.checked(), t1, dt0, may_be_infinite=event is not None)
-    _check_parts(system)
+    _check_parts(as_system(system))
     t1 = as_inexact("t1", t1, state.dtype)
     dt0 = None if dt0 is None else as_inexact("dt0", dt0, state.dtype)
     if stepsize_controller is None:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import jax
 
+import jaxspring
 from tests import docstrings, face, markdown, source
 
 # Packages whose names the text uses, by what they are called there.
@@ -71,7 +72,7 @@ def texts() -> tuple[Text, ...]:
         found.append(Text(path, path.relative_to(root).as_posix(), path.read_text(encoding="utf-8"), near))
     for docstring in docstrings.all_docstrings():
         # Of the code around a function only what it defines: a local name of another function is not meant.
-        near = docstrings.identifiers(docstring.owner) | defined(docstring.file) | quoted(docstring.file)
+        near = docstrings.identifiers(docstring.owner) | defined(docstring.file) | said(docstring.file)
         near |= {name for outer in docstring.within for name in defined(outer)}
         found.append(Text(docstring.path, docstring.place, docstring.text, frozenset(near)))
     return tuple(found)
@@ -107,6 +108,15 @@ def quoted(code: ast.AST) -> frozenset[str]:
     """Texts in some code that are one word: keys, columns, names of files."""
     texts = [node.value for node in ast.walk(code) if isinstance(node, ast.Constant) and isinstance(node.value, str)]
     return frozenset(text for text in texts if re.fullmatch(r"[\w.-]+", text))
+
+
+@functools.cache
+def said(code: ast.AST) -> frozenset[str]:
+    """Words of all texts in some code that are no docstrings: keys, messages, lines that are written to files."""
+    owners = [node for node in ast.walk(code) if isinstance(node, docstrings.Owner) and ast.get_docstring(node)]
+    told = {id(owner.body[0].value) for owner in owners if isinstance(owner.body[0], ast.Expr)}
+    texts = [node.value for node in ast.walk(code) if isinstance(node, ast.Constant) and id(node) not in told]
+    return frozenset(word for text in texts if isinstance(text, str) for word in re.findall(r"[A-Za-z_]\w*", text))
 
 
 @functools.cache
@@ -245,18 +255,24 @@ def command_complaint(line: str) -> str:
     if PLACEHOLDER.search(words[0]):
         return ""
     module = {"bootstrap.py": "bootstrap", "jaxspring": "jaxspring.cli"}.get(words[0], words[0])
-    tree = source.tree(source.ROOT / "bootstrap.py") if module == "bootstrap" else modules().get(module)
-    if tree is None:
+    if module != "bootstrap" and module not in modules():
         return f"there is no {module}"
-    options = quoted(tree) | (quoted(modules()["benchmarks.measure"]) if module.startswith("benchmarks") else frozenset())
+    if module == "jaxspring.cli":
+        trees = [tree for name, tree in modules().items() if name.startswith("jaxspring") and name.endswith((".cli", ".command"))]
+    elif module == "bootstrap":
+        trees = [source.tree(source.ROOT / "bootstrap.py")]
+    else:
+        trees = [modules()[module], modules()["benchmarks.measure"]]
+    options = {option for tree in trees for option in quoted(tree)}
     wanted = [word.split("=")[0] for word in words[1:] if word.startswith("--")] + words[1:2] * (module in ("bootstrap", "jaxspring.cli"))
     unknown = [word for word in wanted if word not in options]
     return f"{module} does not take {', '.join(unknown)}" if unknown else ""
 
 
 def has_path(span: str, page: pathlib.Path) -> bool:
-    """Whether a path exists: from the root, from the library, or from the folder of the file that names it."""
-    return any((folder / span).exists() for folder in (source.ROOT, source.LIBRARY, page.parent))
+    """Whether a path exists: from the root, the library or the folder of the file that names it, or as the end of one in the library."""
+    places = [folder / span for folder in (source.ROOT, source.LIBRARY, page.parent)]
+    return any(place.exists() for place in places) or any(path.as_posix().endswith(f"/{span}") for path in source.files())
 
 
 def has_name(dotted: str, near: frozenset[str]) -> bool:
@@ -266,16 +282,23 @@ def has_name(dotted: str, near: frozenset[str]) -> bool:
         return head in near or head in known()
     if head in FOREIGN:
         return is_foreign(dotted)
-    if head in ("js", "jaxspring") and rest[0] in (*face.SUBMODULES, *face.public()):
-        written = f"js.{'.'.join(rest[: 1 + (rest[0] in face.SUBMODULES)])}"
-        *_, last = rest if len(rest) == 1 else written.split(".")
-        after = rest[written.count(".") :]
-        return written in face.written_as() and (not after or after[0] in members(last))
+    if head in ("js", "jaxspring") and is_public(rest):
+        return True
     if any(is_in_module(name, dotted) for name in modules()):
         return True
     if head in classes():
         return rest[0] in members(head)
     return head in near | known() and all(part in known() for part in rest)
+
+
+def is_public(names: list[str]) -> bool:
+    """Whether the library hands out a thing of that name, itself or a public module of it, and the thing has what is named after it."""
+    face: object = jaxspring
+    while isinstance(face, types.ModuleType) and names and names[0] in getattr(face, "__all__", ()):
+        face, names = getattr(face, names[0]), names[1:]
+    if isinstance(face, types.ModuleType):
+        return face is not jaxspring and not names
+    return not names or names[0] in members(face.__name__ if isinstance(face, type) else "")
 
 
 def is_in_module(module: str, dotted: str) -> bool:

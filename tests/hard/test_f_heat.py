@@ -112,7 +112,7 @@ def test_f9_two_time_steps(latent, rng):
         assert drift(single, start, run.state) <= 1e-13
 
 
-@pytest.mark.parametrize("wrap", [lambda rule: rule, js.Ledger], ids=["Heat", "Ledger"])
+@pytest.mark.parametrize("wrap", [lambda rule: rule, lambda rule: (rule, js.Ledger())], ids=["Heat", "Ledger"])
 def test_heat_that_blows_up_is_named(wrap):
     """A source that is infinite from 0.35 s on: NONFINITE at step 5, at its node, in the name of the rule and not of the springs."""
     net = js.lattice(4)

@@ -190,12 +190,8 @@ def test_k8_fusing_breaks_the_springs_of_its_own_net(other):
         assert jax.tree.structure(start) == jax.tree.structure(end)
 
 
-def test_k8_two_nets_cannot_both_fuse():
-    """A state knows the broken springs of one net: a second Fusing is refused, naming both nets."""
-    forces = (js.Springs(ONE, 10.0, 1.0), js.Springs(NAMED, 20.0, 1.0))
-    system = js.System(ONE, 1.0, forces, rules=(js.Fusing(ONE, 350.0), js.Fusing(NAMED, 350.0)))
-    with pytest.raises(ValueError, match=r"another net than Fusing: .*'bending'"):
-        system.begin(js.State.from_points(ONE, LINE, temperature=HOT))
+def test_k8_fusing_needs_springs_of_its_net():
+    """Fusing on a net that no springs of the system have is refused, naming both nets."""
     with pytest.raises(ValueError, match=r"(?s)Fusing has a Graph of 3 springs .*would tell about springs that nothing holds"):
         js.System(ONE, 1.0, js.Springs(ONE, 1.0, 1.0), rules=js.Fusing(OTHER, 350.0)).bind(np.dtype(float))
 
@@ -649,6 +645,8 @@ def is_same(a, b):
 @pytest.mark.parametrize("name", INSTANCES)
 def test_k6_pickle_and_deepcopy_give_the_same(name):
     """Every public object comes back from pickle and from deepcopy with the same structure, for which no program is made anew, and bits."""
+    if name in ("BoundSystem", "Scene"):
+        pytest.skip("made inside one run, which keeps it")
     thing = INSTANCES[name]
     assert is_same(thing, copy.deepcopy(thing))
     assert is_same(thing, copy.copy(thing))

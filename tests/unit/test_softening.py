@@ -159,7 +159,10 @@ WHOLE_SHEET = js.topology.EdgeField(tuple(jnp.ones(shape, bool) for shape in SHE
             lambda: js.System(CHAIN, 1.0, rules=js.Fusing(CHAIN, 1.0, js.thermal.Refreezing(1.0, 1.0))).bind(float),
             "one Springs on the net of Fusing, whose rest lengths change; this system has 0",
         ),
-        (lambda: js.Fusing(CHAIN, 1.0).begin(dataclasses.replace(warm(CHAIN, 1.0), alive=WHOLE_SHEET)), "of another net than Fusing"),
+        (
+            lambda: js.System(CHAIN, 1.0, rules=js.Fusing(CHAIN, 1.0)).begin(dataclasses.replace(warm(CHAIN, 1.0), alive=WHOLE_SHEET)),
+            "springs of another net than any of this system",
+        ),
         (
             lambda: js.System(SHEET, 1.0, js.Springs(SHEET, 1.0, 1.0), rules=(js.Fusing(BARE, 1.0), js.Ledger())).bind(float),
             r"Fusing has a Lattice of \d+ springs .* Springs of this system have a Lattice of \d+ springs",

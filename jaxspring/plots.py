@@ -167,8 +167,7 @@ def _lines(segments: np.ndarray, alive: np.ndarray, net: Topology, color: Any) -
 
 def _alive(net: Topology, state: State) -> np.ndarray:
     """(E,) which springs are whole. A state that tells of the springs of another net says nothing of this one's."""
-    alive = state.alive_of(net)
-    return np.ones(net.n_springs, bool) if alive is None else np.asarray(net.flatten(alive))
+    return np.asarray(net.flatten(state.alive_of(net)))
 
 
 def _held(net: Topology, state: State, system: System | None) -> np.ndarray:

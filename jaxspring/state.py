@@ -90,9 +90,10 @@ class State(eqx.Module):
         time = self.time if time is None else time
         return dataclasses.replace(self, time=time, position=position, velocity=velocity)
 
-    def alive_of(self, net: Topology) -> EdgeField | None:
-        """Which springs of this net hold, or None where none of them breaks."""
-        return field_of(net, self.alive)
+    def alive_of(self, net: Topology) -> EdgeField:
+        """Which springs of this net hold, a bool edge field; all of them where none breaks."""
+        found = field_of(net, self.alive)
+        return net.own(jnp.ones(shape, bool) for shape in net.family_shapes) if found is None else found
 
     def rest_length_of(self, net: Topology) -> EdgeField | None:
         """Rest lengths of this net's springs that have changed for good [m], or None."""

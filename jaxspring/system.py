@@ -23,6 +23,7 @@ from .bound import BoundSystem, Energy
 from .forces.base import Force, Rule, Scene, check_class
 from .forces.linearisation import Linearisation
 from .linalg.operators import Blocks
+from .memory import entry_at
 from .nodes import Free, Motion, Nodes
 from .pickling import refuse_local_functions
 from .state import State
@@ -174,6 +175,22 @@ class System(Nodes):
         """The constrained state with the memory that forces and rules need."""
         bound, state = self._at(state)
         return bound.begin(state)
+
+    def recall(self, state: State, effect: int) -> Any:
+        """What a part remembers in this state: the value that it keeps there.
+
+        Args:
+            state: one that came out of a run of this system.
+            effect: index of the part, forces first and then rules.
+
+        Raises:
+            ValueError: it remembers nothing there.
+        """
+        _, state = self._at(state)
+        entry = entry_at(state.memory, effect % len(self.parts))
+        if entry is None:
+            raise ValueError(f"part {effect} of this system, {self.effects[effect]}, remembers nothing in this state.")
+        return entry.value
 
     def force(self, state: State) -> Vector:
         """Sum of all forces on each node [N], also where it is held (there it is what the hold must balance)."""

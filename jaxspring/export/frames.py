@@ -214,9 +214,9 @@ def _padded(vectors: np.ndarray) -> np.ndarray:
 def _alive(net: Topology, state: State, n_frames: int, is_series: bool) -> np.ndarray | None:
     """(F, E), or None where the state tells nothing of this net's springs."""
     first = jax.tree.map(lambda a: a[0], state) if is_series else state
-    if first.alive_of(net) is None or not net.n_springs:
+    place = next((i for i, field in enumerate(fields_of(first.alive)) if net.owns(field)), None)
+    if place is None or not net.n_springs:
         return None
-    place = next(i for i, field in enumerate(fields_of(first.alive)) if net.owns(field))
     alive = fields_of(state.alive)[place]
     flat = np.asarray(jax.vmap(net.flatten)(alive) if is_series else net.flatten(alive))
     return np.broadcast_to(flat, (n_frames, net.n_springs))

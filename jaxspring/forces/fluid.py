@@ -173,9 +173,7 @@ class Fluid(Force):
     def begin(self, state: State) -> State:
         """The state with a bit for every spring of `molten`, where springs of other nets break."""
         net = self.net
-        if net is None or state.alive is None or state.alive_of(net) is not None:
-            return state
-        return state.with_alive(net, net.own(jnp.ones(shape, bool) for shape in net.family_shapes))
+        return state if net is None or state.alive is None else state.with_alive(net, state.alive_of(net))
 
     def remember(self, state: State) -> Any:
         """The list that its pairs reuse, or None."""

@@ -16,7 +16,7 @@ from jaxtyping import Array
 
 from ..state import State
 from ..topology.base import Topology
-from ..topology.edge_field import EdgeField
+from ..topology.edge_field import EdgeField, field_of
 from ..vector import Vector
 
 OfSprings = Callable[..., Any]
@@ -24,7 +24,7 @@ OfSprings = Callable[..., Any]
 
 def living(net: Topology, state: State) -> EdgeField | None:
     """Which springs of this net hold; None where none breaks, or where those of another net do."""
-    return state.alive_of(net)
+    return field_of(net, state.alive)
 
 
 def heeding(net: Topology, state: State, function: OfSprings, *fields: Any) -> tuple[OfSprings, tuple[Any, ...]]:

@@ -107,11 +107,8 @@ class Fusing(Rule):
     def begin(self, state: State) -> State:
         """The state with a bit for every spring and, where springs come back, a rest length of every spring."""
         temperature_of(state, "Fusing")
-        alive = state.alive_of(self.net)
-        if alive is None:
-            alive = self.net.own(jnp.ones(shape, bool) for shape in self.net.family_shapes)
         # The same kind of field as a step leaves it, also where it was made by hand.
-        state = state.with_alive(self.net, alive)
+        state = state.with_alive(self.net, state.alive_of(self.net))
         if self.refreezing is None or self.springs is None:
             return state
         lengths = state.rest_length_of(self.net)

@@ -28,7 +28,7 @@ from ..numerics import cast_inexact, stopped
 from ..state import State
 from ..status import Flag, Status
 from ..topology.base import Topology
-from ..topology.edge_field import EdgeField, SpringNumbers, fields_of
+from ..topology.edge_field import EdgeField, SpringNumbers, field_of, fields_of
 from ..topology.lattice import Lattice
 from .boundaries import ThermalBoundary
 from .flow import Flow
@@ -228,7 +228,7 @@ class Heat(Rule):
                 "cut_by says that broken springs conduct nothing, but no spring of this state can break (its `alive` is None). Add the "
                 "rule that breaks springs, or pass cut_by=None."
             )
-        cuts = state.alive_of(self.cut_by)
+        cuts = field_of(self.cut_by, state.alive)
         if cuts is None:
             other = fields_of(state.alive)[0]
             raise ValueError(

@@ -126,8 +126,12 @@ class Topology(eqx.Module):
     def split(self, flat: Array) -> EdgeField:
         """(E,) array in the user's order -> edge field."""
 
-    def flatten(self, field: Numbers | EdgeField) -> Array:
-        """Edge field -> (E,) array in the user's order. One number is repeated; what is (E,) already comes back as it is."""
+    def flatten(self, field: Numbers | EdgeField | tuple[EdgeField, ...]) -> Array:
+        """Edge field -> (E,) array in the user's order. One number is repeated; what is (E,) already comes back as it is; of the fields of
+        several nets, such as `state.alive`, this net's is taken.
+        """
+        if isinstance(field, tuple) and any(isinstance(entry, EdgeField) for entry in field):
+            field = next((entry for entry in field if isinstance(entry, EdgeField) and self.owns(entry)), field)
         if isinstance(field, EdgeField):
             return self._flatten(self._spread(field))
         flat = own("field", field)

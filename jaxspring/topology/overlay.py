@@ -107,12 +107,12 @@ class Overlay(Topology):
 
     @property
     def family_shapes(self) -> tuple[tuple[int, ...], ...]:
-        """((E,),)"""
+        """One family, ((E,),)."""
         return (self.tails.shape,)
 
     @property
     def family_sizes(self) -> tuple[int, ...]:
-        """(E,)"""
+        """Springs of the one family, (E,)."""
         return self.tails.shape
 
     @property

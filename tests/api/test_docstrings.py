@@ -88,7 +88,9 @@ def parameters(owner: docstrings.Owner) -> set[str]:
     """Names of a function's parameters; none of a class or a file."""
     if not isinstance(owner, ast.FunctionDef | ast.AsyncFunctionDef):
         return set()
-    return {argument.arg for argument in (*owner.args.posonlyargs, *owner.args.args, *owner.args.kwonlyargs)}
+    taken = owner.args
+    rest = () if taken.kwarg is None else (taken.kwarg,)
+    return {argument.arg for argument in (*taken.posonlyargs, *taken.args, *taken.kwonlyargs, *rest)}
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)

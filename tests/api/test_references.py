@@ -16,6 +16,10 @@ ELSEWHERE = {
     "XLA_FLAGS=--xla_cpu_max_isa=AVX2": "a variable that XLA reads",
     "fn": "a field of diffrax.SaveAt",
     "root_finder": "a field of diffrax.Event",
+    "pbc": "a word of the XYZ format",
+    "v_x": "a column of such a file",
+    "v_y": "a column of such a file",
+    "v_z": "a column of such a file",
 }
 PAGES = [*source.ROOT.glob("*.md"), *(source.ROOT / "docs").glob("*.md")]
 

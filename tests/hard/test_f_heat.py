@@ -121,5 +121,5 @@ def test_heat_that_blows_up_is_named(wrap):
     run = js.rollout(system, js.State.from_points(net, net.grid(), temperature=300.0), js.SymplecticEuler(), 0.1, 20)
     assert bool(run.status.has(Flag.NONFINITE))
     assert (int(run.status.step), int(run.status.node), int(run.status.effect)) == (5, 2, 1)
-    with pytest.raises(js.SimulationError, match=f"position, velocity or temperature is NaN.*effect {type(wrap(heat)).__name__}"):
+    with pytest.raises(js.SimulationError, match=r"position, velocity or temperature is NaN.*effect Heat"):
         js.raise_for_status(run)

@@ -385,7 +385,7 @@ def test_what_an_adaptive_solver_cannot_honour_is_named():
             return js.Vector.zeros_like(state.position)
 
         def update(self, step, state):
-            """It does."""
+            """The state as it is."""
             return state, js.Status.ok()
 
     for system in (

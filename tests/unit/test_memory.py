@@ -55,7 +55,7 @@ class Counting(js.Rule):
     is_cache: ClassVar[bool] = True
 
     def remember(self, state):
-        """Zero."""
+        """Not asked yet."""
         return jnp.zeros((), jnp.int32)
 
     def update(self, step, state):
@@ -179,11 +179,11 @@ class Sorted(js.Force):
     """A method where a property belongs."""
 
     def force(self, state):
-        """Nothing."""
+        """No pull on any node."""
         return js.Vector.zeros_like(state.position)
 
     def is_symmetric(self, state):
-        """Whether it is."""
+        """Whether the Jacobian is symmetric."""
         return False
 
 

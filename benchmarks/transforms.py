@@ -106,7 +106,7 @@ def melting(p: jax.Array) -> jax.Array:
         points = np.asarray(scene.state.points) * [1.1, 1.0, 1.05] + [0.0, 0.0, 1e-3]
 
     def constants(system: Any) -> tuple[Any, Any]:
-        return system.forces[0].stiffness.full, system.rules[0].rules[0].conductance
+        return system.forces[0].stiffness.full, system.rules[0].conductance
 
     full, conductance = constants(scene.system)
     system = eqx.tree_at(constants, scene.system, (p[0] * full, p[1] * conductance))

@@ -139,7 +139,7 @@ class BoundSystem(Nodes):
         step, stages, impacts = self._step(before, state, dt, bool(obstacles)), [], None
         for i, part in followers:
             if not part.is_obstacle and not part.watches:
-                state, status = part.update(step, state)
+                state, status = _updated(part, step, state)
                 total = total.then(_placed(status, i))
                 stages += [] if isinstance(part, Force) else [(i, state)]
         if obstacles:
@@ -149,7 +149,7 @@ class BoundSystem(Nodes):
             stages.append((-1, state))
         step = replace(step, stages=tuple(stages), impacts=impacts)
         for i, part in watchers:
-            state, status = part.update(step, state)
+            state, status = _updated(part, step, state)
             total = total.then(_placed(status, i))
         return state, total
 
@@ -170,7 +170,7 @@ class BoundSystem(Nodes):
         """Sum of all forces on each node [N], also where it is held (there it is what the hold must balance)."""
         total = None
         for effect in self.forces:
-            f = effect.force(state)
+            f = _on_nodes(effect, effect.force(state), state)
             total = f if total is None else total + f
         return Vector.zeros_like(state.position) if total is None else total
 
@@ -202,6 +202,36 @@ class BoundSystem(Nodes):
         """Kinetic energy and each force's potential [J]."""
         kinetic = 0.5 * jnp.sum(self.mass * state.velocity.dot(state.velocity))
         return Energy(kinetic, tuple(f.energy(state) for f in self.forces))
+
+
+def _on_nodes(effect: Force, force: Any, state: State) -> Vector:
+    """The force, where it is one on each node. A net without springs gives no coordinates, which stands for zero."""
+    if isinstance(force, Vector) and force.dim == 0:
+        return Vector.zeros_like(state.position)
+    if not isinstance(force, Vector) or force.dim != state.dim or force.shape != state.position.shape:
+        found = f"a Vector of {force.dim} arrays of shape {force.shape}" if isinstance(force, Vector) else f"a {type(force).__name__}"
+        wanted = f"a Vector of {state.dim} arrays of shape {state.position.shape}, one for each coordinate"
+        raise TypeError(f"{type(effect).__name__}.force gives {found}; expected {wanted}.")
+    return force
+
+
+def _updated(part: Rule, step: Step, state: State) -> tuple[State, Status]:
+    """The state after a part has acted, and its status.
+
+    Raises:
+        TypeError: what it gives is not these two, or what it keeps has another structure, shape or type than what it remembered.
+    """
+    found: Any = part.update(step, state)
+    name = type(part).__name__
+    if not (isinstance(found, tuple) and len(found) == 2 and isinstance(found[0], State) and isinstance(found[1], Status)):
+        said = ", ".join(type(entry).__name__ for entry in found) if isinstance(found, tuple) else type(found).__name__
+        raise TypeError(f"{name}.update gives {said}; expected a state and a status: return state, js.Status.ok().")
+    old, new = (jax.tree.map(lambda a: (jnp.shape(a), jnp.result_type(a)), s.memory) for s in (state, found[0]))
+    if old != new:
+        raise TypeError(
+            f"{name}.update keeps another structure, shape or type than {name}.remember gave. A memory's shapes must not change."
+        )
+    return found
 
 
 def _placed(status: Status, effect: int) -> Status:

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .archive import CheckpointError, Path, read_archive, write_archive
-from .memory import without_caches
+from .memory import Memory, without_caches
 from .numbering import inward, outward
 from .state import State
 from .topology.base import Topology
@@ -46,7 +46,7 @@ def save(path: Path, tree: PyTree) -> None:
     {'stiffness': 3.0}
     """
     tree = without_caches(tree)
-    about = {"kind": "tree", "form": FORM, "topologies": topologies(tree), "edge_fields": edge_fields(tree)}
+    about = {"kind": "tree", "form": FORM, "topologies": topologies(tree), "edge_fields": edge_fields(tree), "owners": owners(tree)}
     write_archive(path, named_arrays(tree), about)
 
 
@@ -70,6 +70,7 @@ def load(path: Path, like: PyTree = None) -> PyTree:
         return archive.arrays
     expect_same(path, "topology", archive.about.get("topologies"), topologies(like))
     expect_same_springs(path, archive.about.get("edge_fields", {}), edge_fields(like))
+    expect_same_owners(path, archive.about.get("owners", {}), owners(like))
     return restored(path, archive.arrays, without_caches(like), archive.about.get("form", 1))
 
 
@@ -133,7 +134,9 @@ def restored(path: Path, arrays: Mapping[str, np.ndarray], like: PyTree, form: i
     wanted = {leaf_name(p) for p, leaf in leaves if _is_stored(leaf)}
     missing, unknown = sorted(wanted - set(arrays)), sorted(set(arrays) - wanted)
     if missing or unknown:
-        complain(path, f"it lacks {missing[:5]} and has {unknown[:5]} that `like` does not know; expected {sorted(wanted)[:8]}")
+        is_memory = any("memory" in name.split("/") for name in (*missing, *unknown))
+        hint = ". For a state that remembers something pass like=system.begin(state), by which every part has its memory" * is_memory
+        complain(path, f"it lacks {missing[:5]} and has {unknown[:5]} that `like` does not know; expected {sorted(wanted)[:8]}{hint}")
     found = treedef.unflatten([_fitted(path, leaf_name(p), arrays, leaf) for p, leaf in leaves])
     return found if form < FORM else inward(found)
 
@@ -174,6 +177,19 @@ def edge_fields(tree: PyTree) -> dict[str, str]:
     leaves = jax.tree_util.tree_leaves_with_path(tree, is_leaf=lambda x: isinstance(x, EdgeField))
     fields = {leaf_name(path): leaf for path, leaf in leaves if isinstance(leaf, EdgeField)}
     return {name: field.identity.digest for name, field in fields.items() if field.identity is not None}
+
+
+def owners(tree: PyTree) -> dict[str, str]:
+    """For every memory in a tree, the class of the part that it is of, by name."""
+    leaves = jax.tree_util.tree_leaves_with_path(tree, is_leaf=lambda x: isinstance(x, Memory))
+    return {leaf_name(path): leaf.owner.kind for path, leaf in leaves if isinstance(leaf, Memory)}
+
+
+def expect_same_owners(path: Path, found: Mapping[str, str], expected: Mapping[str, str]) -> None:
+    """CheckpointError where what one effect remembers would be read by another."""
+    for name in sorted(set(found) & set(expected)):
+        if found[name] != expected[name]:
+            complain(path, f"its {name!r} is what a {found[name]} remembers; expected that of a {expected[name]}, the part of `like` there")
 
 
 def expect_same_springs(path: Path, found: Mapping[str, str], expected: Mapping[str, str]) -> None:

@@ -13,6 +13,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array
 
@@ -136,6 +137,7 @@ class System(Nodes):
         if other is not None and (other.node_shape != self.net.node_shape or other.node_permutation != self.net.node_permutation):
             raise ValueError(f"{name} ({type(effect).__name__}) was built on another topology than the system.")
         check_class(effect)
+        effect = jax.tree.map(_own_copy, effect)
         if other is not None and not same_box(box_of(other), box_of(self.net)):
             raise ValueError(
                 f"{name} ({type(effect).__name__}) was built on a net with box = {box_of(other)}, but the system's net has "
@@ -229,6 +231,15 @@ class System(Nodes):
         """Kinetic energy and each force's potential [J]."""
         bound, state = self._at(state)
         return bound.energy(state)
+
+
+def _own_copy(leaf: Any) -> Any:
+    """A NumPy array of a part of a user's own as one that nobody else changes; anything else as it is."""
+    if not isinstance(leaf, np.ndarray) or not leaf.flags.writeable:
+        return leaf
+    copied = leaf.copy()
+    copied.setflags(write=False)
+    return copied
 
 
 def _as_free(net: Topology, free: Any) -> Free:

@@ -152,9 +152,26 @@ class Rule(eqx.Module):
         return memory
 
     def recall(self, state: State) -> Any:
-        """What it remembers in this state; what `remember` gives where that is nothing yet."""
-        entry = entry_at(state.memory, self.place)
-        return self.remember(state) if entry is None else entry.value
+        """What it remembers in this state; what `remember` gives where that is nothing yet.
+
+        Raises:
+            ValueError: it gives no `remember`; a part that is not bound, where the state remembers something of several of its kind.
+        """
+        entry = entry_at(state.memory, self.place) if self.place is not None else self._only_entry(state)
+        memory = self.remember(state) if entry is None else entry.value
+        if memory is None:
+            raise ValueError(f"{type(self).__name__} recalls what it never remembered. Give it a method remember(state).")
+        return memory
+
+    def _only_entry(self, state: State) -> Memory | None:
+        """The entry of a part outside its bound system: the one that is of its class and net."""
+        own = [entry for entry in state.memory or () if entry is not None and entry.owner == Owner.of(self)]
+        if len(own) > 1:
+            raise ValueError(
+                f"the state remembers something of {len(own)} parts that are {Owner.of(self)}. Ask the one that is meant: "
+                f"system.bind(state.dtype).parts[i]."
+            )
+        return own[0] if own else None
 
     def keep(self, state: State, memory: Any) -> State:
         """The state in which it remembers this. Only a bound part has a place there."""
@@ -249,6 +266,9 @@ def check_class(part: Rule) -> None:
     says of itself must be a bool, else every condition on it would hold.
     """
     kind = Force if isinstance(part, Force) else Rule
+    kinds = type(part).__mro__[: type(part).__mro__.index(Rule)]
+    if any("place" in vars(kind).get("__annotations__", {}) for kind in kinds):
+        raise TypeError(f"{type(part).__name__} has a field place, which is the part's number in its system. Rename the field.")
     for field in dataclasses.fields(part):
         if field.name != "place" and callable(getattr(kind, field.name, None)):
             raise TypeError(

@@ -187,11 +187,12 @@ def test_an_insulated_body_melts(seed, hot, log_latent, log_conductance):
     start, end, living = torn(jnp.asarray(points), jnp.asarray(rng.normal(size=(N, 2))), jnp.asarray(temperatures), latent, conductance)
     system = scene(latent, conductance)
     book = js.energy_ledger(system, end)
-    heat = system.rules[0].rules[0]
+    heat = system.rules[0]
     assert float(js.thermal.total_heat(heat, end)) == pytest.approx(float(js.thermal.total_heat(heat, start)), rel=1e-14)
     assert abs(book["rules"]["Heat"]["heat"]) <= 1e-11
     fusing = book["rules"]["Fusing"]
-    assert fusing["Springs"] <= 0
+    # A difference of two sums that the compiler adds up each in its own order: nothing, to their rounding.
+    assert fusing["Springs"] <= 4 * np.finfo(float).eps * book["start"]["Springs"]
     assert fusing["Drag"] == fusing["kinetic"] == fusing["heat"] == 0
     assert np.all(np.diff([E, *np.asarray(living)]) <= 0)
     assert abs(book["residual"]) < 1e-10

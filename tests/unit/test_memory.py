@@ -175,6 +175,99 @@ def test_a_part_outside_a_system_has_no_place():
         fading().keep(START, None)
 
 
+def test_a_file_says_whose_memory_it_holds(tmp_path):
+    """The history of one class is never loaded into that of another of the same shapes; a start without memory is told what to pass."""
+
+    class Other(Fading):
+        """The same fields, another law."""
+
+    end = js.rollout(held(fading()), START, js.SymplecticEuler(), 0.01, 5).state
+    js.save(tmp_path / "end.npz", end)
+    other = held(Other(PAIR, jnp.asarray(3.0), jnp.asarray(0.5)))
+    with pytest.raises(js.CheckpointError, match="what a Fading remembers; expected that of a Other"):
+        js.load(tmp_path / "end.npz", like=other.begin(START))
+    with pytest.raises(js.CheckpointError, match=r"like=system\.begin\(state\)"):
+        js.load(tmp_path / "end.npz", like=START)
+    back = js.load(tmp_path / "end.npz", like=held(fading()).begin(START))
+    np.testing.assert_array_equal(back.memory[0].value[0], end.memory[0].value[0])
+
+
+def test_a_part_as_the_user_holds_it_finds_its_memory():
+    """A raw force of a state that came out of a run pulls as the bound one; where several may be meant it says where to ask."""
+    force = fading()
+    end = js.rollout(held(force), START, js.SymplecticEuler(), 0.01, 20).state
+    np.testing.assert_array_equal(force.force(end).x, held(force).force(end).x)
+    twice = js.rollout(held(force, force), START, js.SymplecticEuler(), 0.01, 2).state
+    with pytest.raises(ValueError, match=r"2 parts that are Fading .*system\.bind"):
+        force.force(twice)
+
+
+def acting(update=None, force=None, remember=None):
+    """A force of these methods, as a user may write it wrongly."""
+
+    def still(self, state):
+        return js.Vector.zeros_like(state.position)
+
+    methods = {"force": force or still, "update": update, "remember": remember}
+    kind = type("Mine", (js.Force,), {name: method for name, method in methods.items() if method is not None})
+    return js.System(PAIR, 1.0, kind())
+
+
+def counted(self, state):
+    return jnp.zeros((), jnp.int32)
+
+
+@pytest.mark.parametrize(
+    ("system", "message"),
+    [
+        (lambda: acting(lambda self, step, state: None), "Mine.update gives NoneType; expected a state and a status"),
+        (lambda: acting(lambda self, step, state: state), "Mine.update gives State; expected a state and a status"),
+        (lambda: acting(lambda self, step, state: (state, None)), "Mine.update gives State, NoneType; expected"),
+        (lambda: acting(lambda self, step, state: (self.recall(state), js.Status.ok()), remember=counted), "Mine.update gives .*, Status"),
+        (lambda: acting(lambda self, step, state: (self.keep(state, 1.0), js.Status.ok()), remember=counted), "keeps? another structure"),
+        (lambda: acting(lambda self, step, state: (self.keep(state, jnp.ones(3)), js.Status.ok())), "keeps? another structure"),
+        (lambda: acting(force=lambda self, state: jnp.zeros((2, 1))), "Mine.force gives a .*; expected a Vector of 1 arrays"),
+        (lambda: acting(force=lambda self, state: js.Vector((jnp.ones(()),))), r"a Vector of 1 arrays of shape \(\); expected"),
+    ],
+)
+def test_what_a_users_part_gives_is_looked_at(system, message):
+    """A method that forgets its result, or gives it in another form, is named with its class before it is used."""
+    with pytest.raises(TypeError, match=message):
+        js.rollout(system(), START, js.SymplecticEuler(), 0.01, 2)
+
+
+def test_recalling_what_was_never_remembered_is_named():
+    """A misspelt `remember` leaves nothing to recall: said by its class."""
+    with pytest.raises(ValueError, match=r"Mine recalls what it never remembered.*remember\(state\)"):
+        js.rollout(acting(force=lambda self, state: self.recall(state)), START, js.SymplecticEuler(), 0.01, 2)
+
+
+def test_arrays_of_a_users_part_are_copied():
+    """A NumPy array in a force of one's own that is changed after it was passed no longer changes the system."""
+
+    class Push(js.Force):
+        """A given push."""
+
+        push: np.ndarray
+
+        def force(self, state):
+            """The push."""
+            return js.Vector((jnp.asarray(self.push),))
+
+    given = np.ones(2)
+    system = js.System(PAIR, 1.0, Push(given))
+    given[:] = 9.0
+    np.testing.assert_array_equal(system.force(START).x, [1.0, 1.0])
+
+
+def test_one_node_without_springs():
+    """A force along the springs of a net that has none is no force, on one node too."""
+    net = js.lattice(1)
+    system = js.System(net, 1.0, Fading(net, jnp.asarray(1.0), jnp.asarray(1.0)))
+    end = js.rollout(system, js.State.from_points(net, [[0.0]], [[1.0]]), js.VelocityVerlet(), 0.1, 10).state
+    np.testing.assert_allclose(end.points, [[1.0]], rtol=1e-12)
+
+
 class Sorted(js.Force):
     """A method where a property belongs."""
 
@@ -193,9 +286,16 @@ class Shadowed(js.Rule):
     limit: jax.Array
 
 
+class Placed(js.Rule):
+    """A field of the name that the library keeps for itself."""
+
+    place: jax.Array
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
+        (lambda: js.System(PAIR, 1.0, rules=Placed(jnp.ones(()))), "Placed has a field place, which is the part's number"),
         (lambda: js.System(PAIR, 1.0, Sorted()), r"Sorted.is_symmetric is a \w+; expected a bool: make it a @property"),
         (lambda: js.System(PAIR, 1.0, rules=Shadowed(jnp.ones(()))), "has a field limit, but Rule.limit is a method"),
         (lambda: js.rollout(held().bind(float), START, js.Still(), 0.1, 1), "system is a BoundSystem, which a run makes for itself"),

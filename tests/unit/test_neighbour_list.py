@@ -58,7 +58,7 @@ def test_a_step_beyond_the_skin_is_told(rng):
     )
     fluid = system.bind(state.dtype).forces[0]
     begun = system.begin(state)
-    update = jax.jit(lambda a, b: fluid.update(Step(a, b, jnp.asarray(1e-6)), b)[1].flags)
+    update = jax.jit(lambda a, b: fluid.update(js.Step(a, b, jnp.asarray(1e-6)), b)[1].flags)
     for share, flag in ((1.05, js.Flag.DT_LIMIT), (0.95, 0)):
         after = begun.moved(begun.position + share * 0.05 / 9.0 * begun.velocity, begun.velocity)
         assert int(update(begun, after)) == int(flag)
@@ -98,7 +98,7 @@ def test_every_step_tells_an_overflow(rng):
     system, state = make(blob(rng, 60, spacing=0.8), cutoff=js.fluid.ShiftedForce(2.5), pairs=js.fluid.NeighbourList(8, 0.3))
     fluid = system.bind(state.dtype).forces[0]
     begun = system.begin(state)
-    status = jax.jit(lambda state: fluid.update(Step(state, state, jnp.asarray(1e-6)), state)[1])(begun)
+    status = jax.jit(lambda state: fluid.update(js.Step(state, state, jnp.asarray(1e-6)), state)[1])(begun)
     assert int(status.flags) == int(js.Flag.NEIGHBOUR_OVERFLOW)
     (count,) = (int(found.count) for found in fluid.diagnose(begun) if found.flag == js.Flag.NEIGHBOUR_OVERFLOW)
     assert int(status.count) == count > 8

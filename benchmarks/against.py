@@ -51,9 +51,8 @@ def workloads() -> dict[str, Callable[[], Callable[[], Any]]]:
         grid = np.stack(np.meshgrid(*[np.arange(side)] * 3), axis=-1).reshape(-1, 3) * 1.1
         points = (grid + 0.05 * rng.standard_normal(grid.shape)).astype(np.float32)
         net = js.Graph.from_edges(np.zeros((0, 2), int), len(points))
-        law = js.Fluid(
-            js.fluid.LennardJones(1.0, 1.0), cutoff=js.fluid.ShiftedForce(2.5), pairs=js.fluid.NeighbourList(capacity=96, skin=0.3)
-        )
+        named: Any = getattr(js, "fluid", js)  # an older checkout has these names at the top
+        law = js.Fluid(named.LennardJones(1.0, 1.0), named.ShiftedForce(2.5), named.NeighbourList(capacity=96, skin=0.3))
         system = js.System(net, 1.0, law)
         state = js.State.from_points(net, points)
         return lambda: js.rollout(system, state, js.VelocityVerlet(), 2e-3, n_steps)

@@ -76,16 +76,6 @@ class BoundSystem(Nodes):
         return BoundSystem(net=net, mass=mass, forces=bound[: len(forces)], free=free, motion=motion, rules=rest)
 
     @property
-    def parts(self) -> tuple[Rule, ...]:
-        """Forces, then rules: in the order of their indices in a status."""
-        return (*self.forces, *(self.rules or ()))
-
-    @property
-    def effects(self) -> tuple[str, ...]:
-        """Names of forces and rules, in the order of their indices in a status."""
-        return tuple(type(part).__name__ for part in self.parts)
-
-    @property
     def followers(self) -> tuple[tuple[int, Rule], ...]:
         """Whatever acts after a step, with its index in a status."""
         return tuple((i, part) for i, part in enumerate(self.parts) if acts(part))
@@ -157,7 +147,7 @@ class BoundSystem(Nodes):
         """What the rules may know of a step; what only obstacles ask for is None where there are none."""
         if not meets:
             return Step(before, moved, dt)
-        lagging = tuple(f for f in self.forces if _reads_velocity(f, moved))
+        lagging = tuple(f for f in self.forces if reads_velocity(f, moved))
 
         def by_velocity(velocity: Vector) -> Vector:
             at = moved.moved(moved.position, velocity)
@@ -240,7 +230,7 @@ def _placed(status: Status, effect: int) -> Status:
     return eqx.tree_at(lambda s: s.effect, status, placed)
 
 
-def _reads_velocity(force: Force, state: State) -> bool:
+def reads_velocity(force: Force, state: State) -> bool:
     """Whether the program of a force names the velocities at all."""
     program = jax.make_jaxpr(lambda v: force.force(state.moved(state.position, v)))(state.velocity).jaxpr
     inputs = {id(v) for v in program.invars}
@@ -252,4 +242,4 @@ def _sum_blocks(parts: Iterable[Blocks | None]) -> Blocks:
     return sum((part for part in parts if part is not None), start=Blocks())
 
 
-__all__ = ["BoundSystem", "Energy"]
+__all__ = ["BoundSystem", "Energy", "reads_velocity"]

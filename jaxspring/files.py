@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -187,20 +187,22 @@ def owners(tree: PyTree) -> dict[str, str]:
 
 def expect_same_owners(path: Path, found: Mapping[str, str], expected: Mapping[str, str]) -> None:
     """CheckpointError where what one effect remembers would be read by another."""
-    for name in sorted(set(found) & set(expected)):
-        if found[name] != expected[name]:
-            complain(path, f"its {name!r} is what a {found[name]} remembers; expected that of a {expected[name]}, the part of `like` there")
+    for name, was, wanted in _differing(found, expected):
+        complain(path, f"its {name!r} is what a {was} remembers; expected that of a {wanted}, the part of `like` there")
 
 
 def expect_same_springs(path: Path, found: Mapping[str, str], expected: Mapping[str, str]) -> None:
     """CheckpointError where an edge field of the file is of another net than that of `like`; older files, and fields made by hand, do
     not say.
     """
-    for name in sorted(set(found) & set(expected)):
-        if found[name] != expected[name]:
-            complain(
-                path, f"its {name!r} is about the springs of net {found[name]}; expected those of {expected[name]}, the net of `like` there"
-            )
+    for name, was, wanted in _differing(found, expected):
+        complain(path, f"its {name!r} is about the springs of net {was}; expected those of {wanted}, the net of `like` there")
+
+
+def _differing(found: Mapping[str, str], expected: Mapping[str, str]) -> Iterator[tuple[str, str, str]]:
+    """What both have under a name, where it differs: (name, found, expected)."""
+    names = sorted(set(found) & set(expected))
+    return ((name, found[name], expected[name]) for name in names if found[name] != expected[name])
 
 
 def expect_same(path: Path, what: str, found: Any, expected: Any) -> None:

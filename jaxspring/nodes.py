@@ -1,7 +1,9 @@
 """Nodes with mass, and what holds them: what a system and a bound system have in common.
 
-held       x stays, v = 0
-moved      x = path(t), v = d path / dt
+    held       x stays, v = 0
+    moved      x = path(t), v = d path / dt
+
+Forces and rules are numbered alike in both.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ._arrays import kept
+from .forces.base import Force, Rule
 from .linalg.operators import Blocks, SpringMatrix
 from .state import State
 from .topology.base import Topology
@@ -40,12 +43,24 @@ class Motion(eqx.Module):
 
 
 class Nodes(eqx.Module):
-    """Masses and constraints on the nodes of a net. Abstract: see `System` and `BoundSystem`."""
+    """Masses, constraints and parts on the nodes of a net. Abstract: see `System` and `BoundSystem`."""
 
     net: eqx.AbstractVar[Topology]
     mass: eqx.AbstractVar[Array]
+    forces: eqx.AbstractVar[tuple[Force, ...]]
     free: eqx.AbstractVar[Free]
     motion: eqx.AbstractVar[Motion | None]
+    rules: eqx.AbstractVar[tuple[Rule, ...] | None]
+
+    @property
+    def parts(self) -> tuple[Rule, ...]:
+        """Forces, then rules: in the order of their indices in a status."""
+        return (*self.forces, *(self.rules or ()))
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Names of forces and rules, in the order of their indices in a status."""
+        return tuple(type(part).__name__ for part in self.parts)
 
     def _taken(self, state: State) -> State:
         """The state, where JAX can compute it and it is one state."""
@@ -57,7 +72,7 @@ class Nodes(eqx.Module):
 
     def constrain(self, state: State) -> State:
         """The state with held nodes at rest and moved nodes on their schedule."""
-        state = eqx.tree_at(lambda s: s.velocity, state.checked(), self.hold(state.velocity))
+        state = eqx.tree_at(lambda s: s.velocity, self._taken(state), self.hold(state.velocity))
         if self.motion is None:
             return state
         position, velocity = self.motion.at(state.time)

@@ -33,30 +33,17 @@ def inward(tree: PyTree) -> PyTree:
 
 
 def _reordered(tree: PyTree, reorder: Reorder) -> PyTree:
+    def of_field(node: Any) -> Any:
+        return _edge_field(node, reorder) if isinstance(node, EdgeField) else node
+
     def of_node(node: Any) -> Any:
-        if isinstance(node, EdgeField):
-            return _edge_field(node, reorder)
         if isinstance(node, State):
-            return _with_fields(node, ("position", "velocity", "temperature", "enthalpy"), node.layout.permutation, reorder)
-        if isinstance(node, Nodes):
-            return _with_fields(node, ("mass", "free"), node.net.node_permutation, reorder)
-        return node
+            node = _with_fields(node, ("position", "velocity", "temperature", "enthalpy"), node.layout.permutation, reorder)
+        elif isinstance(node, Nodes):
+            node = _with_fields(node, ("mass", "free"), node.net.node_permutation, reorder)
+        return jax.tree.map(of_field, node, is_leaf=lambda part: isinstance(part, EdgeField))
 
-    # The outermost first, then what it holds.
-    def is_known(node: Any) -> bool:
-        return isinstance(node, EdgeField | State | Nodes)
-
-    outer = jax.tree.map(of_node, tree, is_leaf=is_known)
-    return jax.tree.map(lambda node: _inner(node, reorder) if isinstance(node, State | Nodes) else node, outer, is_leaf=is_known)
-
-
-def _inner(node: Any, reorder: Reorder) -> Any:
-    """The edge fields that a state or a system holds."""
-
-    def is_field(part: Any) -> bool:
-        return isinstance(part, EdgeField)
-
-    return jax.tree.map(lambda part: _edge_field(part, reorder) if is_field(part) else part, node, is_leaf=is_field)
+    return jax.tree.map(of_node, tree, is_leaf=lambda node: isinstance(node, EdgeField | State | Nodes))
 
 
 def _edge_field(field: EdgeField, reorder: Reorder) -> EdgeField:

@@ -20,7 +20,7 @@ from jaxtyping import Array
 
 from ._arrays import Numbers, given
 from ._checks import as_inexact, finite, has_shape, is_concrete
-from .bound import BoundSystem
+from .bound import BoundSystem, reads_velocity
 from .events import on_states
 from .forces.base import acts, remembers
 from .numerics import linear_call
@@ -280,7 +280,7 @@ def _terms(system: BoundSystem, state: State, solver: Any) -> Any:
 
     structure, name = solver.term_structure, type(solver).__name__
     if isinstance(structure, tuple):
-        if system.motion is not None or _reads_velocity(system, state):
+        if system.motion is not None or any(reads_velocity(force, state) for force in system.forces):
             raise ValueError(
                 f"{name} splits position from velocity, so it cannot take forces that depend on velocity (drag, dashpots), nor moved "
                 f"nodes. Use another solver, or rollout with SymplecticEuler() or VelocityVerlet()."
@@ -293,17 +293,6 @@ def _terms(system: BoundSystem, state: State, solver: Any) -> Any:
             f"Use a solver of one term: diffrax.Tsit5(), or diffrax.Kvaerno5() where the springs are stiff."
         )
     return diffrax.ODETerm(_flow)
-
-
-def _reads_velocity(system: BoundSystem, state: State) -> bool:
-    """Whether the program of the acceleration reads the velocity at all."""
-
-    def acceleration(velocity: Vector) -> Vector:
-        return system.acceleration(eqx.tree_at(lambda s: s.velocity, state, velocity))
-
-    program = jax.make_jaxpr(acceleration)(state.velocity).jaxpr
-    read = {id(v) for equation in program.eqns for v in equation.invars} | {id(v) for v in program.outvars}
-    return any(id(v) in read for v in program.invars)
 
 
 class _OfState(eqx.Module):

@@ -137,23 +137,14 @@ class System(Nodes):
         if other is not None and (other.node_shape != self.net.node_shape or other.node_permutation != self.net.node_permutation):
             raise ValueError(f"{name} ({type(effect).__name__}) was built on another topology than the system.")
         check_class(effect)
-        effect = jax.tree.map(_own_copy, effect)
+        if any(_is_shared(leaf) for leaf in jax.tree.leaves(effect)):
+            effect = jax.tree.map(_own_copy, effect)
         if other is not None and not same_box(box_of(other), box_of(self.net)):
             raise ValueError(
                 f"{name} ({type(effect).__name__}) was built on a net with box = {box_of(other)}, but the system's net has "
                 f"{box_of(self.net)}. Some forces would act through the walls, and others not. Build all on one net."
             )
         return effect
-
-    @property
-    def parts(self) -> tuple[Rule, ...]:
-        """Forces, then rules: in the order of their indices in a status."""
-        return (*self.forces, *(self.rules or ()))
-
-    @property
-    def effects(self) -> tuple[str, ...]:
-        """Names of forces and rules, in the order of their indices in a status."""
-        return tuple(type(part).__name__ for part in self.parts)
 
     def bind(self, dtype: DTypeLike) -> BoundSystem:
         """The system as a loop wants it: every constant in the shape of the topology and of `dtype`, every part knowing its masses, its
@@ -233,9 +224,14 @@ class System(Nodes):
         return bound.energy(state)
 
 
+def _is_shared(leaf: Any) -> bool:
+    """Whether a leaf of a part of a user's own is a NumPy array that somebody else may change."""
+    return isinstance(leaf, np.ndarray) and leaf.flags.writeable
+
+
 def _own_copy(leaf: Any) -> Any:
-    """A NumPy array of a part of a user's own as one that nobody else changes; anything else as it is."""
-    if not isinstance(leaf, np.ndarray) or not leaf.flags.writeable:
+    """Such an array as one that nobody else changes; anything else as it is."""
+    if not _is_shared(leaf):
         return leaf
     copied = leaf.copy()
     copied.setflags(write=False)

@@ -5,9 +5,12 @@ from __future__ import annotations
 import contextlib
 import pathlib
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
-from ..archive import Path, atomic_folder
+import numpy as np
+
+from ..archive import Path, atomic_file, atomic_folder
+from .frames import Frames
 
 # Endings that are taken for a file's where a folder is wanted.
 OF_FILES = {".extxyz", ".npz", ".ply", ".pvd", ".vtk", ".vtp", ".vtu", ".xyz"}
@@ -27,6 +30,37 @@ def file_place(path: Path, suffixes: tuple[str, ...], reader: str) -> pathlib.Pa
         raise IsADirectoryError(f"{path} is a folder; choose another name for the file.")
     _check_parent(path)
     return path
+
+
+def write_frames(
+    path: Path,
+    suffix: str,
+    reader: str,
+    frames: Frames,
+    render: Callable[[Frames, int], bytes],
+    collection: tuple[str, Callable[[list[str], np.ndarray], bytes]] | None = None,
+) -> None:
+    """One state as the file `path`; frames as a folder of numbered files, and one more that lists them where a format has such.
+
+    Args:
+        path: the file, or the folder.
+        suffix: of the files.
+        reader: what reads them, for messages.
+        frames: what is written.
+        render: the bytes of frame i.
+        collection: suffix of the file that lists the others, and its bytes from their names and times [s]; None: no such file.
+    """
+    if not frames.is_series:
+        place, data = file_place(path, (suffix,), reader), render(frames, 0)
+        with atomic_file(place) as stream:
+            stream.write(data)
+        return
+    with series_folder(path, suffix, "" if collection is None else collection[0], len(frames)) as (folder, names):
+        for i, name in enumerate(names):
+            (folder / name).write_bytes(render(frames, i))
+        if collection is not None:
+            listing = names[0].rpartition("_")[0] + collection[0]
+            (folder / listing).write_bytes(collection[1](names, frames.time))
 
 
 @contextlib.contextmanager
@@ -69,4 +103,4 @@ def _check_parent(path: pathlib.Path) -> None:
         raise FileNotFoundError(f"{parent} is no folder, so {path.name} cannot be written there.")
 
 
-__all__ = ["file_place", "series_folder"]
+__all__ = ["file_place", "series_folder", "write_frames"]

@@ -8,10 +8,10 @@ from __future__ import annotations
 import numpy as np
 
 from .._arrays import Numbers
-from ..archive import Path, atomic_file
+from ..archive import Path
 from ..topology.base import Topology
 from .frames import Frames, NodeFields, States, frames_of
-from .places import file_place, series_folder
+from .places import write_frames
 
 TYPES = {"f4": "float", "f8": "double", "i4": "int", "u1": "uchar"}
 
@@ -53,14 +53,7 @@ def save_ply(
     (3, [1.0, 0.0, 0.0])
     """
     frames = frames_of(states, net, node_fields, triangles=triangles)
-    if not frames.is_series:
-        place, data = file_place(path, (".ply",), "a viewer"), _mesh(frames, 0)
-        with atomic_file(place) as stream:
-            stream.write(data)
-        return
-    with series_folder(path, ".ply", "", len(frames)) as (folder, names):
-        for i, name in enumerate(names):
-            (folder / name).write_bytes(_mesh(frames, i))
+    write_frames(path, ".ply", "a viewer", frames, _mesh)
 
 
 def _mesh(frames: Frames, i: int) -> bytes:

@@ -12,10 +12,10 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from .._arrays import Numbers
-from ..archive import Path, atomic_file
+from ..archive import Path
 from ..topology.base import Topology
 from .frames import Frames, NodeFields, SpringFields, States, frames_of
-from .places import file_place, series_folder
+from .places import write_frames
 
 VERTEX, LINE, TRIANGLE = 1, 3, 5  # VTK's numbers of these cells
 TYPES = {"f4": "Float32", "f8": "Float64", "i4": "Int32", "i8": "Int64", "u1": "UInt8", "b1": "UInt8"}
@@ -64,16 +64,7 @@ def save_vtk(
     <VTKFile type="UnstructuredGrid" versi
     """
     frames = frames_of(states, net, node_fields, spring_fields, triangles)
-    if not frames.is_series:
-        place, data = file_place(path, (".vtu",), "ParaView"), _grid(frames, 0)
-        with atomic_file(place) as stream:
-            stream.write(data)
-        return
-    with series_folder(path, ".vtu", ".pvd", len(frames)) as (folder, names):
-        for i, name in enumerate(names):
-            (folder / name).write_bytes(_grid(frames, i))
-        collection = names[0].rpartition("_")[0] + ".pvd"
-        (folder / collection).write_bytes(_collection(names, frames.time))
+    write_frames(path, ".vtu", "ParaView", frames, _grid, (".pvd", _collection))
 
 
 def _collection(names: list[str], time: np.ndarray) -> bytes:

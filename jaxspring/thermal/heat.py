@@ -118,7 +118,7 @@ class Heat(Rule):
         self.scheme.check(net)
         given = tuple(boundaries) if isinstance(boundaries, Iterable) else (boundaries,)
         self.boundaries = tuple(_kind(f"boundaries[{i}]", b, ThermalBoundary) for i, b in enumerate(given))
-        self.source = source if source is None or callable(source) else _source(net, source)
+        self.source = source if source is None or callable(source) else _source(source)
         self.latent = None if latent is None else _kind("latent", latent, LatentHeat)
         self._on_net()  # refuses what does not fit
         for name, count in (("substeps", substeps), ("every", every)):
@@ -193,7 +193,8 @@ class Heat(Rule):
 
     def limit(self, state: State) -> Array | None:
         """Largest dt [s] of the nodes' steps at which an explicit scheme is stable and makes no new extreme; None for the others."""
-        return self._limit(self._rate(state))
+        ready = self.ready(state.dtype)
+        return ready._limit(ready._rate(state))
 
     def _limit(self, rate: Array) -> Array | None:
         limit = self.scheme.limit(jnp.max(rate))
@@ -325,7 +326,7 @@ def _conductance(net: Topology, value: Any) -> Any:
     return value
 
 
-def _source(net: Topology, value: Any) -> Array:
+def _source(value: Any) -> Array:
     value = as_inexact("source", value)
     finite("source", value)
     return value

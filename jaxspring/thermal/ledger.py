@@ -99,14 +99,15 @@ class Ledger(Rule):
     def update(self, step: Step, state: State) -> tuple[State, Status]:
         """The state with the step in the books."""
         account: Account = self.recall(state)
-        n_forces = len(self._parts()[0])
+        forces, rules = self._parts()
         before = step.before
         stages, columns, places = [before, step.moved], [account.now, self.columns(step.moved)], [-1]
         for place, after in step.stages:
-            is_still = place >= 0 and not (self._parts()[1][place - n_forces].moves or self._parts()[1][place - n_forces].breaks)
+            row = place - len(forces) if place >= 0 else -1
+            is_still = row >= 0 and not (rules[row].moves or rules[row].breaks)
             columns.append(self.columns(after, columns[-1] if is_still else None))
             stages.append(after)
-            places.append(place - n_forces if place >= 0 else -1)
+            places.append(row)
         mean = 0.5 * (before.velocity + state.velocity)
         books, momenta = jnp.zeros_like(account.rules), jnp.zeros_like(account.impulses)
         motion = jnp.zeros_like(account.motion)
@@ -198,10 +199,12 @@ def energy_ledger(system: Any, state: State, which: int = 0) -> dict[str, Any]:
         raise ValueError("there is no ledger. Pass rules=(..., Ledger()) to System, and a state that came out of rollout.")
     account = entry.value
     forces, rules = _names(system.forces), _names(system.rules)
+    changing = [i for i, rule in enumerate(system.rules) if not rule.watches]
     columns = ("kinetic", *forces, "heat")
     start, now, work, motion, books = (
         np.asarray(a, np.float64) for a in (account.start, account.now, account.work, account.motion, account.rules)
     )
+    impulses = np.asarray(account.impulses, np.float64).tolist()
     integration = float(np.sum(motion) - np.sum(work))
 
     def named(values: np.ndarray) -> dict[str, float]:
@@ -211,14 +214,10 @@ def energy_ledger(system: Any, state: State, which: int = 0) -> dict[str, Any]:
         "start": named(start),
         "end": named(now),
         "work": dict(zip(forces, map(float, work), strict=True)),
-        "rules": {name: named(row) for name, row in zip(rules, books, strict=True) if not name.startswith("Ledger")},
+        "rules": {rules[i]: named(books[i]) for i in changing},
         "integration": integration,
         "residual": float(np.sum(now - start) - np.sum(work) - integration - np.sum(books)),
-        "impulses": {
-            name: row
-            for name, row in zip(("motion", *rules), np.asarray(account.impulses, np.float64).tolist(), strict=True)
-            if not name.startswith("Ledger")
-        },
+        "impulses": {"motion": impulses[0], **{rules[i]: impulses[1 + i] for i in changing}},
     }
 
 

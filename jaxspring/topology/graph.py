@@ -7,7 +7,6 @@ has shape (N,), an edge field holds one entry of shape (E,). How pulls are summe
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable
 from typing import Any
 
@@ -19,16 +18,15 @@ from jaxtyping import Array, Int
 from .._arrays import Edges, Numbers, whole_number
 from .._checks import node_indices, triangle_indices
 from ..vector import Vector
-from .base import Topology
 from .edge_field import EdgeField
-from .identity import NetIdentity
+from .listed import ListedSprings, arranged, digest_of
 from .overlay import Overlay
 from .periods import as_box, minimum_image
-from .permutation import Permutation, locality_order
+from .permutation import Permutation
 from .reduction import Gather, Reduction, Scatter, choose_reduction
 
 
-class Graph(Topology):
+class Graph(ListedSprings):
     """Nodes joined by an arbitrary list of springs. Build it with `Graph.from_edges`, `delaunay` or `from_triangles`.
 
     Attributes:
@@ -53,7 +51,7 @@ class Graph(Topology):
     nodes: Permutation = eqx.field(static=True)
     springs: Permutation = eqx.field(static=True)
     digest: str = eqx.field(static=True)
-    name: str | None = eqx.field(static=True, default=None)
+    name: str | None = eqx.field(static=True)
 
     @staticmethod
     def from_edges(
@@ -87,13 +85,8 @@ class Graph(Topology):
         if n_nodes < 1:
             raise ValueError(f"n_nodes = {n_nodes}, but a network needs at least 1 node.")
         pairs = node_indices("edges", edges, n_nodes)
-        near = locality_order(pairs, n_nodes)
-        inner = np.argsort(near)[pairs]
-        springs = Permutation(np.lexsort((inner.max(axis=1), inner.min(axis=1))))
-        tails, heads = inner[springs.order].T
-        sums, order = (choose_reduction(n_nodes) if reduction is None else reduction).build(tails, heads, n_nodes)
-        nodes = Permutation(near[order])
-        tails, heads = nodes.inverse[pairs[springs.order]].T
+        kind = choose_reduction(n_nodes) if reduction is None else reduction
+        tails, heads, sums, order, springs = arranged(pairs, n_nodes, kind)
         return Graph(
             tails=jnp.asarray(tails),
             heads=jnp.asarray(heads),
@@ -101,36 +94,16 @@ class Graph(Topology):
             box=as_box(box),
             triangles=None if triangles is None else _as_triangles(triangles, n_nodes),
             count=n_nodes,
-            nodes=nodes,
+            nodes=Permutation(order),
             springs=springs,
-            digest=hashlib.sha256(np.ascontiguousarray(pairs, "<i4").data).hexdigest()[:16] if len(pairs) else "",
+            digest=digest_of(pairs),
+            name=None,
         )
 
     @property
     def node_shape(self) -> tuple[int, ...]:
         """Shape of a node array: (N,)."""
         return (self.count,)
-
-    @property
-    def family_shapes(self) -> tuple[tuple[int, ...], ...]:
-        """Shape of an edge field of the only family of springs: ((E,),)."""
-        return (self.tails.shape,)
-
-    @property
-    def family_sizes(self) -> tuple[int, ...]:
-        """Number of springs of the only family: (E,)."""
-        return self.tails.shape
-
-    def inside(self, field: EdgeField, fill: float) -> EdgeField:
-        """The field itself: a graph keeps no margins."""
-        return field
-
-    @property
-    def identity(self) -> NetIdentity:
-        """The springs' digest, and the name."""
-        return NetIdentity(
-            "Graph", (f"{self.count} nodes", f"{self.springs.order.size} springs", f"digest {self.digest}"), self.name, self.springs
-        )
 
     @property
     def node_permutation(self) -> Permutation:
@@ -146,10 +119,6 @@ class Graph(Topology):
     def with_edges(self, edges: Edges, name: str | None = None) -> Overlay:
         """A further net over the same nodes: see `Topology.with_edges`."""
         return Overlay.on(self.layout, self.box, edges, name)
-
-    def unboxed(self) -> Graph:
-        """The same springs without periods."""
-        return eqx.tree_at(lambda net: net.box, self, None, is_leaf=lambda leaf: leaf is None)
 
     def difference(self, x: Vector) -> EdgeField:
         """Head minus tail along each spring."""
@@ -167,14 +136,6 @@ class Graph(Topology):
     def average(self, a: Array) -> EdgeField:
         """Mean of a node array over the two ends of each spring."""
         return self.own((self.reduction.mean_of_ends(a, self.tails, self.heads),))
-
-    def split(self, flat: Array) -> EdgeField:
-        """(E,) array in the user's order -> edge field."""
-        return self.own((self.springs.inward(flat),))
-
-    def _flatten(self, field: EdgeField) -> Array:
-        """Edge field -> (E,) array in the user's order."""
-        return self.springs.outward(field.families[0])
 
     def _per_array(self, function: Callable[[Array, Array, Array], Array], v: Vector) -> Vector:
         return v.map(lambda a: function(a, self.tails, self.heads))

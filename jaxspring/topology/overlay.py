@@ -7,7 +7,6 @@ The node set owns the order of nodes, chosen by its first net. Each net over it 
 
 from __future__ import annotations
 
-import hashlib
 import math
 from functools import partial
 from typing import Any
@@ -21,11 +20,11 @@ from .._arrays import Edges
 from .._checks import node_indices
 from ..numerics import linear_call
 from ..vector import Vector
-from .base import NodeLayout, Topology
+from .base import NodeLayout
 from .edge_field import EdgeField
-from .identity import NetIdentity
+from .listed import ListedSprings, arranged, digest_of
 from .periods import minimum_image
-from .permutation import Permutation, locality_order
+from .permutation import Permutation
 from .reduction import Reduction, choose_reduction
 
 # Nodes per touched node from which on writing to the touched ones is faster than having every node read.
@@ -34,7 +33,7 @@ SPARSE = 8
 _SURE: Any = {"mode": "promise_in_bounds", "wrap_negative_indices": False}
 
 
-class Overlay(Topology):
+class Overlay(ListedSprings):
     """Springs over the nodes of another net. Build it with `net.with_edges`.
 
     Attributes:
@@ -59,7 +58,7 @@ class Overlay(Topology):
     nodes: NodeLayout = eqx.field(static=True)
     springs: Permutation = eqx.field(static=True)
     digest: str = eqx.field(static=True)
-    name: str | None = eqx.field(static=True, default=None)
+    name: str | None = eqx.field(static=True)
 
     @staticmethod
     def on(nodes: NodeLayout, box: Array | None, edges: Edges, name: str | None = None) -> Overlay:
@@ -71,27 +70,21 @@ class Overlay(Topology):
         if not len(touched):
             touched = np.zeros(1, int)  # arrays of no length compile nowhere
         local = local.reshape(-1, 2)
-        near = locality_order(local, len(touched))
-        inner = np.argsort(near)[local]
-        springs = Permutation(np.lexsort((inner.max(axis=1), inner.min(axis=1))))
-        tails, heads = inner[springs.order].T
-        reduction, order = choose_reduction(len(touched)).build(tails, heads, len(touched))
-        to_inner = np.argsort(near[order])
-        where = touched[near[order]].astype(np.int32)
+        tails, heads, sums, order, springs = arranged(local, len(touched), choose_reduction(len(touched)))
+        where = touched[order].astype(np.int32)
         back = np.full(count, len(touched), np.int32)
         back[where] = np.arange(len(touched), dtype=np.int32)
-        tails, heads = to_inner[local[springs.order]].astype(np.int32).T
         reads = len(touched) * SPARSE >= count
         return Overlay(
             tails=jnp.asarray(tails),
             heads=jnp.asarray(heads),
-            reduction=reduction,
+            reduction=sums,
             where=jnp.asarray(where),
             back=jnp.asarray(back) if reads else None,
             box=box,
             nodes=nodes,
             springs=springs,
-            digest=hashlib.sha256(np.ascontiguousarray(pairs, "<i4").data).hexdigest()[:16] if len(pairs) else "",
+            digest=digest_of(pairs),
             name=name,
         )
 
@@ -106,22 +99,6 @@ class Overlay(Topology):
         return self.nodes.permutation
 
     @property
-    def family_shapes(self) -> tuple[tuple[int, ...], ...]:
-        """One family, ((E,),)."""
-        return (self.tails.shape,)
-
-    @property
-    def family_sizes(self) -> tuple[int, ...]:
-        """Springs of the one family, (E,)."""
-        return self.tails.shape
-
-    @property
-    def identity(self) -> NetIdentity:
-        """The springs' digest, and the name."""
-        springs = (f"{math.prod(self.node_shape)} nodes", f"{self.springs.order.size} springs", f"digest {self.digest}")
-        return NetIdentity("Overlay", springs, self.name, self.springs)
-
-    @property
     def edges(self) -> np.ndarray:
         """(E, 2) tail and head of each spring, in the user's order and numbering."""
         places = np.asarray(self.where)[np.stack([np.asarray(self.tails), np.asarray(self.heads)], axis=-1)]
@@ -131,14 +108,6 @@ class Overlay(Topology):
     def with_edges(self, edges: Edges, name: str | None = None) -> Overlay:
         """A further net over the same nodes: see `Topology.with_edges`."""
         return Overlay.on(self.layout, self.box, edges, name)
-
-    def unboxed(self) -> Overlay:
-        """The same springs without periods."""
-        return eqx.tree_at(lambda net: net.box, self, None, is_leaf=lambda leaf: leaf is None)
-
-    def inside(self, field: EdgeField, fill: float) -> EdgeField:
-        """The field itself: no margins are kept."""
-        return field
 
     def difference(self, x: Vector) -> EdgeField:
         """Head minus tail along each spring."""
@@ -156,14 +125,6 @@ class Overlay(Topology):
     def average(self, a: Array) -> EdgeField:
         """Mean of a node array over the two ends of each spring."""
         return self.own((self.reduction.mean_of_ends(self._taken(a), self.tails, self.heads),))
-
-    def split(self, flat: Array) -> EdgeField:
-        """(E,) array in the user's order -> edge field."""
-        return self.own((self.springs.inward(flat),))
-
-    def _flatten(self, field: EdgeField) -> Array:
-        """Edge field -> (E,) array in the user's order."""
-        return self.springs.outward(field.families[0])
 
     def _taken(self, a: Array) -> Array:
         """Node array -> (T,)."""

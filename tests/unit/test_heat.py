@@ -154,13 +154,13 @@ def test_limit_of_an_explicit_step():
     rate = (np.array([90.0, 92.0, 5.0, 3.0]) + [0, 0, radiation, 3.5] + 1.0) / c
     state = js.State.from_points(net, net.grid(), temperature=t)
     for held, worst in ((boundaries, rate[1:].max()), (boundaries[1:], rate.max())):
-        limit = js.Heat(net, c, g, boundaries=held).ready(float).limit(state)
+        limit = js.Heat(net, c, g, boundaries=held).limit(state)
         assert float(limit) == pytest.approx(1 / worst, rel=1e-12)
     assert rate[2] < rate[1] < rate[0]
     hot = js.Heat(net, c, [1.0, 2.0, 3.0], boundaries=boundaries[:2])
-    assert float(hot.ready(float).limit(state)) == pytest.approx(3.0 / (5.0 + radiation), rel=1e-12)
+    assert float(hot.limit(state)) == pytest.approx(3.0 / (5.0 + radiation), rel=1e-12)
     seldom = js.Heat(net, c, g, boundaries=boundaries, substeps=6, every=2)
-    assert float(seldom.ready(float).limit(state)) == pytest.approx(3 / rate[1:].max(), rel=1e-12)
+    assert float(seldom.limit(state)) == pytest.approx(3 / rate[1:].max(), rel=1e-12)
 
 
 def test_nothing_limits_implicit_heat_of_nodes_that_stand_still():

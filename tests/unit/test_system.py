@@ -184,3 +184,13 @@ def test_mask_and_state_of_different_dimension(scene):
     net, state, m = scene
     with pytest.raises(ValueError, match="free has 3 coordinates"):
         js.System(net, m, js.Drag(0.1), free=np.ones((5, 3), bool)).acceleration(state)
+
+
+def test_every_question_refuses_stacked_systems():
+    """What needs no forces refuses many systems stacked, too: their masses would be stretched over the nodes without a word."""
+    net = js.lattice(2)
+    systems = jax.tree.map(lambda *a: jnp.stack(a), *(js.System(net, np.array([1.0, m])) for m in (2.0, 3.0)))
+    state = js.State.from_points(net, net.grid())
+    for ask in (systems.constrain, systems.momentum, systems.force, systems.energy):
+        with pytest.raises(ValueError, match="these are many systems"):
+            ask(state)

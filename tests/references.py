@@ -37,7 +37,7 @@ FOREIGN = {
 # What stands in a text for whatever the reader puts there.
 PLACEHOLDER = re.compile(r"\b(?:NAME|DIR|IMAGE)\b")
 PATH = re.compile(r"[\w./-]+(?:\.(?:py|md|toml|lock|yml|sh)|/)")
-FILE = re.compile(r"[\w-]+\.(?:npz|npy|json|png|gif|pvd|vtu|ply)")
+FILE = re.compile(r"[\w-]+\.(?:npz|npy|json|png|gif)")
 NAME = re.compile(r"[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*")
 CALL = re.compile(rf"({NAME.pattern})\((.*)\)")
 KEYWORD = re.compile(r"(\w+)=(?!=)")

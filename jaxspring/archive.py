@@ -95,10 +95,15 @@ def read_archive(path: Path) -> Archive:
 
 @contextlib.contextmanager
 def atomic_file(path: Path) -> Iterator[IO[bytes]]:
-    """A stream whose bytes appear at `path` at the end, all at once and on the disk; on an error nothing appears."""
-    target = pathlib.Path(path)
+    """A stream whose bytes appear at `path` at the end, all at once and on the disk; on an error nothing appears.
+
+    A link stays one: what it points to is written.
+    """
+    target = pathlib.Path(os.path.realpath(path))
     if not target.parent.is_dir():
         raise FileNotFoundError(f"{target.parent} is no folder, so {target.name} cannot be written there.")
+    if target.is_dir():
+        raise IsADirectoryError(f"{os.fspath(path)} is a folder; choose another name for the file.")
     beside = target.parent / f".{target.name}.{secrets.token_hex(4)}.tmp"
     try:
         with open(beside, "xb") as stream:
@@ -114,8 +119,11 @@ def atomic_file(path: Path) -> Iterator[IO[bytes]]:
 
 @contextlib.contextmanager
 def atomic_folder(path: Path) -> Iterator[pathlib.Path]:
-    """A new folder, filled beside `path` and put in its place at the end, whole; what was there before goes only then."""
-    target = pathlib.Path(path).absolute()
+    """A new folder, filled beside `path` and put in its place at the end, whole; what was there before goes only then.
+
+    A link stays one: the folder that it points to is replaced.
+    """
+    target = pathlib.Path(os.path.realpath(path))
     beside = target.parent / f".{target.name}.{secrets.token_hex(4)}.tmp"
     old = beside.with_suffix(".old")
     beside.mkdir()
@@ -135,7 +143,7 @@ def atomic_folder(path: Path) -> Iterator[pathlib.Path]:
 
 def remove_leftovers(path: Path) -> None:
     """Delete temporary files that killed writers of `path` left beside it. Only for the one process that writes `path`."""
-    target = pathlib.Path(path)
+    target = pathlib.Path(os.path.realpath(path))
     for left in target.parent.glob(f".{target.name}.*.tmp"):
         left.unlink(missing_ok=True)
 

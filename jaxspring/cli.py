@@ -9,12 +9,13 @@ from __future__ import annotations
 import argparse
 import importlib
 import os
+import pathlib
 import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
 from ._version import __version__
-from .scenes.command import Command, FailedError, StoppedError, UnusableError, check_folder
+from .scenes.command import Command, FailedError, StoppedError, UnusableError, Written, check_folder
 
 DONE, FAILED, UNUSABLE, INTERRUPTED = 0, 1, 2, 130
 # The scenes with a command: the name of each one's package in `scenes`. What the command is called and takes is said there, in `command`.
@@ -67,10 +68,10 @@ def own_commands() -> list[Command]:
 
 def run(command: Command, given: argparse.Namespace) -> tuple[int, str]:
     """Do the work and say what was written; returns the exit code and, where there was trouble, what it was."""
-    out = command.folder(given)
     try:
+        out = pathlib.Path(command.folder(given))
         check_folder(out)
-    except OSError as error:
+    except (UnusableError, OSError) as error:
         return UNUSABLE, str(error)
     from .archive import CheckpointError
 
@@ -82,6 +83,10 @@ def run(command: Command, given: argparse.Namespace) -> tuple[int, str]:
         return FAILED, str(error)
     except (UnusableError, CheckpointError, OSError, ImportError, MemoryError) as error:
         return UNUSABLE, str(error) or "there is not enough memory."
+    if not isinstance(written, Written):
+        raise TypeError(
+            f"the run of {command.name!r} returned {type(written).__name__}; expected a Written, which says what the folder holds."
+        )
     print(written.table)
     print(f"Written to {out}{os.sep}: {written.files}.")
     return DONE, ""

@@ -32,7 +32,9 @@ def save(path: Path, tree: PyTree) -> None:
 
     Args:
         path: the file; `.npz` is the fitting suffix, since `numpy.load` opens it.
-        tree: what to save. Leaves that are no arrays or numbers (functions) are not stored: `load` takes them from `like`.
+        tree: what to save. States, systems and edge fields are stored in the user's order of nodes and springs; a bare `Vector` or array as
+            it is, which on a graph is the graph's own order: save `net.flatten_nodes(a)` of it instead. Leaves that are no
+            arrays or numbers (functions) are not stored: `load` takes them from `like`.
 
     Raises:
         TypeError: a leaf holds something other than real or complex numbers or booleans; half precision that NumPy lacks.

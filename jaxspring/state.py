@@ -26,7 +26,8 @@ class State(eqx.Module):
         position: `Vector` in node shape [m].
         velocity: `Vector` in node shape [m/s].
         layout: how node fields are stored (static).
-        temperature: node shape [K], or None where the scene has no heat.
+        temperature: node shape [K], or None where the scene has no heat. On a graph this is the graph's own order, as it is of all that is
+            in node shape: `temperatures`, `points` and `velocities` are the user's.
         enthalpy: heat that melting has taken up, of each node [J], or None without latent heat.
         alive: bool edge field, False where a spring has broken; a tuple of such fields where the springs of several nets break; None where
             none does. `alive_of(net)` is that of one net.

@@ -38,7 +38,7 @@ class System(Nodes):
 
     Attributes:
         net: the topology.
-        mass: [kg], a number or a node array.
+        mass: [kg], a number or a node array, on a graph in the graph's own order: `net.flatten_nodes(system.mass)` is in the user's.
         forces: the effects of the scene, in the order of their indices in statuses.
         free: None (all move), a bool node array, or one per coordinate: False is held at its place, exactly.
         motion: nodes moved by a schedule, or None.

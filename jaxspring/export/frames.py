@@ -19,6 +19,7 @@ from ..state import State
 from ..topology.base import Topology
 from ..topology.edge_field import EdgeField, fields_of
 from ..topology.periods import box_of
+from ..vector import Vector
 
 if TYPE_CHECKING:
     from ..ode import OdeResult
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
 # One state, a state with a leading axis of frames, or a run that kept whole states.
 States: TypeAlias = "State | Result | OdeResult"
-NodeFields: TypeAlias = "Mapping[str, Numbers] | None"
+NodeFields: TypeAlias = "Mapping[str, Numbers | Vector] | None"
 SpringFields: TypeAlias = "Mapping[str, Numbers | EdgeField] | None"
 
 # Names that a file gives to what the state holds, or that its readers take for something else.
@@ -71,8 +72,11 @@ def frames_of(
 
     Raises:
         TypeError: no state; something traced; a field that holds no real numbers.
-        ValueError: no frames; states of another net; a NaN; a field of another shape, or under a name that cannot be one.
+        ValueError: no frames, or all of one time; states of another net; a NaN; a field of another shape, or under a name that cannot be
+            one.
     """
+    if not isinstance(net, Topology):
+        raise TypeError(f"net is a {type(net).__name__}; expected the topology of the states, such as js.lattice(4) gives.")
     state = _states(states)
     if is_traced(state, net):
         raise TypeError("the states are traced (made inside jit, grad or vmap), so there are no numbers to write. Write them outside.")
@@ -86,6 +90,13 @@ def frames_of(
     points = _framed(_numbers("points", state.points), is_series)
     if not len(points):
         raise ValueError("the states have an axis of 0 frames, so there is nothing to write.")
+    time = np.broadcast_to(_numbers("time", state.time), (len(points),))
+    if len(time) > 1 and (time == time[0]).all():
+        raise ValueError(
+            f"all {len(time)} frames are of the time {time[0]} s, by which viewers tell them apart. Of a batch write one each: "
+            f"jax.tree.map(lambda a: a[0], states). To steps of a load give times: "
+            f"dataclasses.replace(states, time=jnp.arange({len(time)}.0))."
+        )
     fields = {"velocity": _padded(_framed(_numbers("velocities", state.velocities), is_series))}
     if state.temperature is not None:
         fields["temperature"] = _framed(_numbers("temperatures", state.temperatures), is_series)
@@ -93,7 +104,7 @@ def frames_of(
     box = np.zeros(3) if box_of(net) is None else np.pad(np.asarray(box_of(net), float), (0, 3 - state.dim))
     return Frames(
         is_series=is_series,
-        time=np.broadcast_to(_numbers("time", state.time), (len(points),)),
+        time=time,
         points=_padded(points),
         node_fields=fields | reader.all("node_fields", node_fields, reader.node_field),
         spring_fields=reader.all("spring_fields", spring_fields, reader.spring_field),
@@ -141,7 +152,7 @@ class _Reader:
 
     def node_field(self, name: str, value: Any) -> np.ndarray:
         """(F, N), or (F, N, 3) of a vector."""
-        array, n = _numbers(name, value), self.net.n_nodes
+        array, n = _numbers(name, self._stacked(name, value)), self.net.n_nodes
         lead, of_frame = ((self.n_frames,), "frame and ") if self.is_series else ((), "")
         allowed = {"one per node": (n,), f"one per {of_frame}node": (*lead, n), "a vector of each": (*lead, n, self.dim)}
         _check_shape(name, array, allowed | {"node shape": (*lead, *self.net.node_shape)})
@@ -156,6 +167,16 @@ class _Reader:
         allowed = {"one per spring": (n,)} | ({"one per frame and spring": (self.n_frames, n)} if self.is_series else {})
         _check_shape(name, array, allowed)
         return np.broadcast_to(array, (self.n_frames, n))
+
+    def _stacked(self, name: str, value: Any) -> Any:
+        """The coordinates of a `Vector`, which is in the net's own order, in the user's; anything else as it is."""
+        if not isinstance(value, Vector):
+            return value
+        if is_traced(value):
+            raise TypeError(f"{name} is traced (made inside jit, grad or vmap), so it has no numbers to write. Write it outside.")
+        if value.shape[-len(self.net.node_shape) :] != self.net.node_shape:
+            raise ValueError(f"{name} is a Vector of arrays of shape {value.shape}; the net's nodes have {self.net.node_shape}.")
+        return np.stack([np.asarray(self.net.flatten_nodes(a)) for a in value], axis=-1)
 
     def _flat(self, name: str, value: Any) -> Any:
         """An edge field, of one state or of all frames, in the user's order; anything else as it is."""

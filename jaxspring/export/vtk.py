@@ -42,8 +42,9 @@ def save_vtk(
         path: the file, or for frames the folder.
         states: a `State`, a `State` with a leading axis of F frames, or what `rollout` returned with `save_every`.
         net: the topology.
-        node_fields: name -> (N,) or node shape, or (N, D) of a vector; in a series each with F before it, or (N,) for all
-            frames. Beside them stand `velocity` [m/s] and, where the state has one, `temperature` [K].
+        node_fields: name -> (N,) or node shape, or (N, D) of a vector, in the user's order; in a series each with F before it,
+            or (N,) for all frames. A `Vector`, such as a force, brings its order along. Beside them
+            stand `velocity` [m/s] and, where the state has one, `temperature` [K].
         spring_fields: name -> (E,) or an edge field; in a series one per frame, or one for all. Beside them stand `alive`, 0 where a
             spring has broken, where springs break, and `wraps`, 1 where a spring passes through a side of a periodic box.
         triangles: (T, 3) node numbers of a surface, e.g. `net.triangles`; None writes none.

@@ -29,7 +29,8 @@ def save_xyz(path: Path, states: States, net: Topology, node_fields: NodeFields 
         path: the file, which ends in `.xyz` or `.extxyz`.
         states: a `State`, a `State` with a leading axis of F frames, or what `rollout` returned with `save_every`.
         net: the topology.
-        node_fields: name -> (N,) or node shape, or (N, D) of a vector; in a series each with F before it, or (N,) for all frames.
+        node_fields: name -> (N,) or node shape, or (N, D) of a vector, in the user's order; in a series each with F before it,
+            or (N,) for all frames. A `Vector`, such as a force, brings its order along.
 
     Raises:
         TypeError: what is no state, traced, or holds no real numbers.

@@ -16,6 +16,7 @@ from __future__ import annotations
 import abc
 import functools
 from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -29,8 +30,14 @@ from ..numerics import power_of_two
 from .image import Image, of_order_one
 from .smoothing import Length, smooth
 
+T = TypeVar("T")
+
+
 # One program instead of a dozen where a function is called outside `jit`; inside, it leaves no trace.
-_one_program = functools.partial(jax.jit, inline=True)
+# A plain function stands before it, since a compiled one does not pickle under its own name.
+def _one_program(function: Callable[[Image], T]) -> Callable[[Image], T]:
+    program = jax.jit(function, inline=True)
+    return functools.wraps(function)(lambda image: program(image))
 
 
 @_one_program

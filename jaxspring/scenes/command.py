@@ -7,11 +7,14 @@ for cannot be done, `FailedError` where it went wrong, `StoppedError` where Ctrl
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import os
 import pathlib
 from collections.abc import Callable
 from dataclasses import dataclass
+
+REPORT = "report.json"
 
 
 @dataclass(frozen=True)
@@ -69,8 +72,34 @@ def check_folder(out: pathlib.Path) -> None:
         raise PermissionError(f"--out {out}: the folder {parent} cannot be written; choose another with --out.")
     if out.exists() and not out.is_dir():
         raise FileExistsError(f"--out {out}: this is a file; choose a folder with --out.")
-    if out.is_dir() and any(out.iterdir()) and not (out / "report.json").is_file():
-        raise FileExistsError(f"--out {out}: the folder holds other files, which would be lost; choose another with --out.")
+    if out.is_dir():
+        check_replaceable(out)
+
+
+def check_replaceable(out: pathlib.Path) -> None:
+    """OSError unless everything in this folder is what an earlier job wrote there, as its report says: the folder will be replaced."""
+    if pathlib.Path.cwd().is_relative_to(out.resolve()):
+        raise FileExistsError(f"--out {out}: the folder in which you are cannot be replaced; choose another with --out.")
+    ours = _listed(out / REPORT)
+    others = [name for name in file_names(out) if name not in ours]
+    if others:
+        named = ", ".join(others[:3])
+        raise FileExistsError(f"--out {out}: the folder holds other files ({named}), which would be lost; choose another with --out.")
+
+
+def file_names(folder: pathlib.Path) -> list[str]:
+    """Every file in a folder and its folders, and every folder that holds nothing, as `pictures/loss.png`; sorted."""
+    found = (path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir() or not any(path.iterdir()))
+    return sorted(path.relative_to(folder).as_posix() for path in found)
+
+
+def _listed(report: pathlib.Path) -> set[str]:
+    """The files that a report says were written with it."""
+    try:
+        files = json.loads(report.read_text(encoding="utf-8"))["files"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return set()
+    return {name for name in files if isinstance(name, str)} if isinstance(files, list) else set()
 
 
 def number(text: str) -> float:
@@ -91,4 +120,16 @@ def whole_number(text: str) -> int:
     return int(text)
 
 
-__all__ = ["Command", "FailedError", "StoppedError", "UnusableError", "Written", "check_folder", "number", "whole_number"]
+__all__ = [
+    "REPORT",
+    "Command",
+    "FailedError",
+    "StoppedError",
+    "UnusableError",
+    "Written",
+    "check_folder",
+    "check_replaceable",
+    "file_names",
+    "number",
+    "whole_number",
+]

@@ -15,9 +15,9 @@ import jax
 
 from .._version import __version__
 from ..archive import atomic_folder
-from .command import FailedError
+from .command import REPORT, FailedError, check_replaceable, file_names
 
-REPORT, CHECKPOINT = "report.json", "checkpoint.npz"
+CHECKPOINT = "checkpoint.npz"
 PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "equinox", "optax", "optimistix", "lineax", "diffrax", "matplotlib", "pillow", "tifffile")
 
 
@@ -51,19 +51,27 @@ class ResultFolder:
         """A folder beside `out`, for the job to write into. It holds the report, and stands in the place of `out` once the block has ended.
 
         Args:
-            report: what `report.json` holds; no NaN and no infinity.
+            report: what `report.json` holds; no NaN and no infinity. Its `files` are those of the folder: by them a later job knows that
+                it may replace them.
             keep_checkpoint: the checkpoint goes into the folder, so that a later run can go on from a finished one; else it is deleted.
             lost: what `--resume` spares where the results could not be written.
 
         Raises:
-            FailedError: the folder cannot be written. What was there before is there still, and so is the checkpoint.
+            ValueError: the report has an entry `files` of its own.
+            FailedError: the folder cannot be written, or holds what no job wrote. What was there before is there still, and so is the
+                checkpoint.
         """
+        if "files" in report:
+            raise ValueError("the report has an entry 'files', which is for the names of the folder's files; rename it.")
         try:
             with atomic_folder(self.out) as folder:
-                (folder / REPORT).write_text(json.dumps(report, indent=2, allow_nan=False) + "\n", encoding="utf-8")
                 yield folder
                 if keep_checkpoint:
                     shutil.copyfile(self.checkpoint, folder / CHECKPOINT)
+                whole = {**report, "files": sorted({REPORT, *file_names(folder)})}
+                (folder / REPORT).write_text(json.dumps(whole, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+                if self.out.exists():
+                    check_replaceable(self.out)
         except OSError as error:
             again = f"; --resume tries again without {lost}." if self.checkpoint.exists() else "."
             raise FailedError(f"the results could not be written ({error}){again}") from error

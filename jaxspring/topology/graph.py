@@ -113,8 +113,7 @@ class Graph(ListedSprings):
     @property
     def edges(self) -> np.ndarray:
         """(E, 2) tail and head of each spring, in the user's order and numbering."""
-        inner = np.stack([np.asarray(self.tails), np.asarray(self.heads)], axis=-1)
-        return self.nodes.order[inner][self.springs.inverse]
+        return self.nodes.order[self._ends()][self.springs.inverse]
 
     def with_edges(self, edges: Edges, name: str | None = None) -> Overlay:
         """A further net over the same nodes: see `Topology.with_edges`."""

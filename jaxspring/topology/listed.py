@@ -34,18 +34,22 @@ class ListedSprings(Topology):
     @property
     def family_shapes(self) -> tuple[tuple[int, ...], ...]:
         """Shape of an edge field of the only family of springs: ((E,),)."""
-        return (self.tails.shape,)
+        return (self.family_sizes,)
 
     @property
     def family_sizes(self) -> tuple[int, ...]:
         """Number of springs of the only family: (E,)."""
-        return self.tails.shape
+        return (self.springs.order.size,)
 
     @property
     def identity(self) -> NetIdentity:
         """The springs' digest, and the name."""
         springs = (f"{self.n_nodes} nodes", f"{self.springs.order.size} springs", f"digest {self.digest}")
         return NetIdentity(type(self).__name__, springs, self.name, self.springs)
+
+    def _ends(self) -> np.ndarray:
+        """(E, 2) places of tail and head, on the host."""
+        return np.stack([of_one(self.tails), of_one(self.heads)], axis=-1)
 
     def unboxed(self) -> Self:
         """The same springs without periods."""
@@ -86,9 +90,15 @@ def arranged(pairs: np.ndarray, n_nodes: int, reduction: Any) -> tuple[np.ndarra
     return tails, heads, sums, nodes, springs
 
 
+def of_one(table: Array) -> np.ndarray:
+    """A table on the host; of stacked nets, which are all one, the first's."""
+    array = np.asarray(table)
+    return array.reshape(-1, array.shape[-1])[0] if array.ndim > 1 else array
+
+
 def digest_of(pairs: np.ndarray) -> str:
     """Of the springs in the user's numbering and order."""
     return hashlib.sha256(np.ascontiguousarray(pairs, "<i4").data).hexdigest()[:16] if len(pairs) else ""
 
 
-__all__ = ["ListedSprings", "arranged", "digest_of"]
+__all__ = ["ListedSprings", "arranged", "digest_of", "of_one"]

@@ -22,7 +22,7 @@ from ..numerics import linear_call
 from ..vector import Vector
 from .base import NodeLayout
 from .edge_field import EdgeField
-from .listed import ListedSprings, arranged, digest_of
+from .listed import ListedSprings, arranged, digest_of, of_one
 from .periods import minimum_image
 from .permutation import Permutation
 from .reduction import Reduction, choose_reduction
@@ -101,7 +101,7 @@ class Overlay(ListedSprings):
     @property
     def edges(self) -> np.ndarray:
         """(E, 2) tail and head of each spring, in the user's order and numbering."""
-        places = np.asarray(self.where)[np.stack([np.asarray(self.tails), np.asarray(self.heads)], axis=-1)]
+        places = of_one(self.where)[self._ends()]
         users = places if self.node_permutation is None else self.node_permutation.order[places]
         return users[self.springs.inverse]
 

@@ -5,6 +5,7 @@ import importlib
 import inspect
 import json
 import pathlib
+import pickle
 import re
 import types
 
@@ -163,3 +164,12 @@ def test_no_public_name_is_also_a_module_of_the_package(name):
     folder = face.file(name).parent
     modules = {path.stem for path in folder.iterdir()} if face.file(name).name == "__init__.py" else set()
     assert not modules & {one for one in module.__all__ if not isinstance(getattr(module, one), types.ModuleType)}
+
+
+@each_face
+def test_every_public_class_and_function_pickles(name):
+    """It goes to other processes under its own name, and comes back as itself."""
+    module = face.faces()[name]
+    for public in (getattr(module, name) for name in module.__all__):
+        if callable(public) and not isinstance(public, types.GenericAlias):
+            assert pickle.loads(pickle.dumps(public)) is public

@@ -13,6 +13,8 @@ import pytest
 
 from jaxspring import cli
 from jaxspring.archive import read_archive
+from jaxspring.scenes.command import Command, FailedError, UnusableError, Written, check_folder
+from jaxspring.scenes.folder import ResultFolder
 from jaxspring.scenes.reconstruction import command
 from tests import source
 
@@ -150,9 +152,80 @@ def test_folders_that_cannot_be_used_get_one_line_and_code_2(hill, capsys):
     pathlib.Path("other/thesis.tex").touch()
     assert "does not exist" in complaint(["fit", hill, "--out", "no/where"], capsys)
     assert "this is a file" in complaint(["fit", hill, "--out", hill], capsys)
-    assert "other files, which would be lost" in complaint(["fit", hill, "--out", "other"], capsys)
+    assert "other files (thesis.tex), which would be lost" in complaint(["fit", hill, "--out", "other"], capsys)
     assert "there is no checkpoint" in complaint(["fit", hill, "--resume"], capsys)
     assert sorted(os.listdir()) == [hill, "other"]
+
+
+def test_nothing_but_an_earlier_result_is_replaced(folder):
+    """A report beside files of somebody else's, a report that names no files, the folder in which one is, and one that grew meanwhile."""
+    place, out = ResultFolder(pathlib.Path("out")), pathlib.Path("out")
+
+    def fill():
+        with place.filling({"lowest": 1.0}) as inside:
+            (inside / "pictures").mkdir()
+            (inside / "pictures" / "a.png").touch()
+            (inside / "b.txt").touch()
+
+    fill()
+    assert json.loads((out / "report.json").read_text()) == {"lowest": 1.0, "files": ["b.txt", "pictures/a.png", "report.json"]}
+    check_folder(out)
+    fill()
+    (out / "pictures" / "thesis.tex").touch()
+    with pytest.raises(FileExistsError, match=r"holds other files \(pictures/thesis\.tex\), which would be lost"):
+        check_folder(out)
+    with pytest.raises(FailedError, match="thesis"):
+        fill()
+    assert (out / "pictures" / "thesis.tex").exists()
+    for text in ("{}", "not JSON", '{"files": "report.json"}', "[]", '{"files": null}'):
+        mine = pathlib.Path("mine")
+        mine.mkdir(exist_ok=True)
+        (mine / "report.json").write_text(text)
+        with pytest.raises(FileExistsError, match=r"other files \(report\.json\)"):
+            check_folder(mine)
+    for here in (".", "..", str(pathlib.Path.cwd())):
+        with pytest.raises(FileExistsError, match="the folder in which you are"):
+            check_folder(pathlib.Path(here))
+    assert sorted(os.listdir()) == ["mine", "out"]
+
+
+def test_a_linked_folder_stays_linked(folder):
+    """Results go to where the link points."""
+    os.mkdir("disk")
+    pathlib.Path("out").symlink_to(pathlib.Path("disk", "out").absolute(), target_is_directory=True)
+    for _ in range(2):
+        with ResultFolder(pathlib.Path("out")).filling({}) as inside:
+            (inside / "b.txt").touch()
+    assert os.path.islink("out")
+    assert (sorted(os.listdir()), os.listdir("disk")) == (["disk", "out"], ["out"])
+
+
+def test_a_report_may_not_name_files_itself(folder):
+    """The entry is the folder's."""
+    with pytest.raises(ValueError, match="an entry 'files'"), ResultFolder(pathlib.Path("out")).filling({"files": []}):
+        pass
+    assert os.listdir() == []
+
+
+@pytest.mark.parametrize(("trouble", "code"), [(UnusableError("no such place"), cli.UNUSABLE), (OSError("no disk"), cli.UNUSABLE)])
+def test_trouble_with_the_folder_itself_is_one_line(trouble, code, folder, capsys):
+    """Raised where a scene says where its results go."""
+
+    def place(given):
+        raise trouble
+
+    scene = Command("swing", "", "", lambda parser: None, place, lambda given, out: Written("", ""))
+    assert cli.main(["swing"], [scene], "swing") == code
+    assert capsys.readouterr().err == f"swing: {trouble}\n"
+
+
+def test_a_folder_may_be_a_string_and_a_job_says_what_it_wrote(folder, capsys):
+    """What a scene of a user's own may get wrong."""
+    as_text = Command("swing", "", "", lambda parser: None, lambda given: "out", lambda given, out: Written("done", "a file"))
+    assert cli.main(["swing"], [as_text], "swing") == cli.DONE
+    silent = Command("swing", "", "", lambda parser: None, lambda given: "out", lambda given, out: None)
+    with pytest.raises(TypeError, match="returned NoneType; expected a Written"):
+        cli.main(["swing"], [silent], "swing")
 
 
 def test_transparent_pixels_are_refused_and_the_option_named(folder, capsys):

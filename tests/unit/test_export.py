@@ -30,7 +30,9 @@ def random_state(net, dim, rng, dtype=np.float64, temperature=None):
 
 
 def stacked(*states):
-    """States on a leading axis."""
+    """States on a leading axis, one second apart where they are of one time."""
+    if len({np.asarray(state.time).tobytes() for state in states}) == 1 and np.ndim(states[0].time) == 0:
+        states = [dataclasses.replace(state, time=state.time + i) for i, state in enumerate(states)]
     return jax.tree.map(lambda *a: jnp.stack(a), *states)
 
 
@@ -223,7 +225,7 @@ def test_xyz_brings_every_number_back(dtype, rng, tmp_path):
         assert columns["held"].ravel().tolist() == [1, 1, 0, 0, 0]
         assert (columns["temperature"] == 300).all()
         assert set(columns["species"].ravel()) == {"X"}
-        assert (dtype.type(about["Time"]), about["pbc"]) == (dtype.type(0.1), "F F F")
+        assert (dtype.type(about["Time"]), about["pbc"]) == (dtype.type(frames.time[i]), "F F F")
         assert "Lattice" not in about
 
 
@@ -289,6 +291,8 @@ NAN = js.State(ONE.time, ONE.position.map(lambda a: a.at[2].set(jnp.nan)), ONE.v
         (js.State.from_points(SHEET, SHEET.grid()), {}, ValueError, r"arrays have shape \(3, 4\), the net's nodes \(5,\)"),
         (stacked(frames(), frames()), {}, ValueError, "Of a batch of runs take one"),
         (frames(2).moved(*(jax.tree.map(lambda a: a[:0], v) for v in (frames().position, frames().velocity))), {}, ValueError, "0 frames"),
+        (jax.tree.map(lambda a: jnp.stack([a, a]), ONE), {}, ValueError, r"all 2 frames are of the time 0\.0 s.*Of a batch write one each"),
+        (ONE, {"node_fields": {"a": SHEET.vector_field(SHEET.grid())}}, ValueError, r"node_fields\['a'\] is a Vector of .*\(3, 4\)"),
         (NAN, {}, ValueError, r"points\[\d, 0\] = nan.*raise_for_status"),
         (ONE, {"node_fields": {"a": np.ones(4)}}, ValueError, r"node_fields\['a'\] has shape \(4,\); expected \(5,\)"),
         (ONE, {"node_fields": {"a": np.ones((2, 5))}}, ValueError, r"node_fields\['a'\] has shape \(2, 5\)"),
@@ -315,6 +319,41 @@ def test_what_cannot_be_written_is_refused_by_name(states, options, error, words
     with pytest.raises(error, match=words):
         js.save_vtk(tmp_path / name, states, RING, **options)
     assert os.listdir(tmp_path) == []
+
+
+def test_a_vector_is_written_in_the_users_order(rng, tmp_path):
+    """A force is kept in the graph's own order and says so by its type: of one state and of frames, it is written node by node."""
+    system = js.System(RING, 1.0, js.Springs(RING, 3.0, 0.5))
+    one, other = random_state(RING, 2, rng, np.float32), random_state(RING, 2, rng, np.float32)
+    expected = [np.stack([RING.flatten_nodes(a) for a in system.force(s)], axis=1) for s in (one, other)]
+    assert not np.array_equal(expected[0][:, 0], system.force(one).x)
+    js.save_xyz(tmp_path / "one.xyz", one, RING, {"force": system.force(one)})
+    both = stacked(one, other)
+    js.save_xyz(tmp_path / "both.xyz", both, RING, {"force": jax.vmap(system.force)(both)})
+    for name, n in (("one", 1), ("both", 2)):
+        for (_, frame), wanted in zip(read_xyz(tmp_path / f"{name}.xyz"), expected[:n], strict=True):
+            np.testing.assert_array_equal(np.asarray(frame["force"], np.float32)[:, :2], wanted)
+
+
+def test_a_link_stays_a_link(tmp_path):
+    """Of a file or a folder: what it points to is written, nothing else appears."""
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "run").symlink_to(tmp_path / "disk" / "run", target_is_directory=True)
+    (tmp_path / "a.vtu").symlink_to(tmp_path / "disk" / "a.vtu")
+    for _ in range(2):
+        js.save_vtk(tmp_path / "run", frames(), RING)
+        js.save_vtk(tmp_path / "a.vtu", ONE, RING)
+    assert (tmp_path / "run").is_symlink()
+    assert (tmp_path / "a.vtu").is_symlink()
+    assert sorted(os.listdir(tmp_path)) == ["a.vtu", "disk", "run"]
+    assert sorted(os.listdir(tmp_path / "disk")) == ["a.vtu", "run"]
+    assert len(os.listdir(tmp_path / "run")) == 3
+
+
+def test_a_net_that_is_none_is_named(tmp_path):
+    """The states without their net."""
+    with pytest.raises(TypeError, match="net is a NoneType; expected the topology of the states"):
+        js.save_vtk(tmp_path / "a.vtu", ONE, None)
 
 
 def test_a_run_without_whole_states_is_refused(tmp_path):

@@ -52,6 +52,20 @@ def test_a_system_comes_back(tmp_path):
         np.testing.assert_array_equal(a, b)
 
 
+def test_stacked_systems_come_back(tmp_path):
+    """A batch of systems of one renumbered graph, and of a net over it: counts, edges and every array."""
+    for net in (NET, NET.with_edges([(3, 0), (4, 2)])):
+        systems = [js.System(net, k * np.arange(1.0, 7.0), js.Springs(net, k, 1.0), free=np.arange(6) > 1) for k in (1.0, 2.0, 3.0)]
+        batch = jax.tree.map(lambda *a: jnp.stack(a), *systems)
+        assert f" {net.n_springs} springs" in str(batch)
+        np.testing.assert_array_equal(batch.net.edges, net.edges)
+        js.save(tmp_path / "s.npz", batch)
+        np.testing.assert_array_equal(js.load(tmp_path / "s.npz")["mass"], np.outer([1, 2, 3], np.arange(1.0, 7.0)))
+        back = js.load(tmp_path / "s.npz", like=batch)
+        for a, b in zip(jax.tree.leaves(back), jax.tree.leaves(batch), strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
 def old_file(path, tree, more=()):
     """As the form before wrote it: arrays as the library keeps them, and no form."""
     arrays = {}

@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 
 import jaxspring as js
-from jaxspring.topology.reduction import choose_reduction
 
 from . import scenes
 from .measure import Case, Panel, arguments, draw, measure, ratio_of_pairs, show, write
@@ -69,26 +68,23 @@ def lattices(sizes: list[tuple[int, int]], rounds: int) -> list[dict]:
 
 
 def graphs(sizes: list[tuple[int, int]], rounds: int) -> list[dict]:
-    """One row per size: the library's default against both of its reductions and the bare scatter form."""
+    """One row per size: the rollout and the bare scatter form."""
     rows = []
     for n_nodes, n_steps in sizes:
-        by_kind = {kind.__name__: scenes.mesh(n_nodes, reduction=kind) for kind in (js.topology.Gather, js.topology.Scatter)}
-        default = choose_reduction(n_nodes).__name__
-        cases = [Case("bare scatter", *scenes.bare_mesh(*by_kind["Scatter"], DT, n_steps))]
-        cases += [Case(kind, *scenes.program(system, state, DT, n_steps)) for kind, (system, state) in by_kind.items()]
+        system, state = scenes.mesh(n_nodes)
+        cases = [Case("bare", *scenes.bare_mesh(system, state, DT, n_steps)), Case("rollout", *scenes.program(system, state, DT, n_steps))]
         timed = measure(cases, rounds)
-        bare = timed["bare scatter"].run_s
+        bare, run = timed["bare"].run_s, timed["rollout"].run_s
         rows.append(
             {
                 "nodes": n_nodes,
                 "steps": n_steps,
-                "default": default,
                 "bare_M": n_nodes * n_steps / bare / 1e6,
-                **{f"{kind}_M": n_nodes * n_steps / timed[kind].run_s / 1e6 for kind in by_kind},
-                "default_over_bare": timed[default].run_s / bare,
-                "compile_s": timed[default].compile_s,
-                "memory_mib": timed[default].temporary_mib,
-                "error": error(*by_kind[default]),
+                "rollout_M": n_nodes * n_steps / run / 1e6,
+                "over_bare": run / bare,
+                "compile_s": timed["rollout"].compile_s,
+                "memory_mib": timed["rollout"].temporary_mib,
+                "error": error(system, state),
             }
         )
     return rows
@@ -114,7 +110,7 @@ def picture(lattice_rows: list[dict], graph_rows: list[dict], path: Path) -> Non
         ("bare scan, padded slices", "s--"): (cells, [row["bare_M"] for row in lattice_rows]),
         ("edge list, stacked, scatter-add", "^:"): (cells, [row["rollout_M"] / row["over_edge_list"] for row in lattice_rows]),
     }
-    styles = {("Gather", "o-"): "Gather_M", ("Scatter", "s--"): "Scatter_M", ("bare scatter", "^:"): "bare_M"}
+    styles = {("rollout, statuses on", "o-"): "rollout_M", ("bare scan, scatter-add", "^:"): "bare_M"}
     mesh = {style: (nodes, [row[name] for row in graph_rows]) for style, name in styles.items()}
     speed = "million node-steps / s"
     draw([Panel("cloth, 6 spring families", speed, cloth, log=True), Panel("Delaunay mesh", speed, mesh, log=True)], path)

@@ -24,7 +24,7 @@ def sheet(n: int, seed: int = 0) -> tuple[js.System, js.State]:
     return _hung(net, flat, rest, rng)
 
 
-def mesh(n_nodes: int, seed: int = 0, reduction: Any = js.topology.Gather) -> tuple[js.System, js.State]:
+def mesh(n_nodes: int, seed: int = 0) -> tuple[js.System, js.State]:
     """Random points in a square, joined by Delaunay's triangulation, in space, float32."""
     from scipy.spatial import Delaunay
 
@@ -32,7 +32,7 @@ def mesh(n_nodes: int, seed: int = 0, reduction: Any = js.topology.Gather) -> tu
     points = rng.random((n_nodes, 2)) * np.sqrt(n_nodes)
     corners = Delaunay(points).simplices
     edges = np.unique(np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1), axis=0)
-    net = js.Graph.from_edges(edges, n_nodes, reduction=reduction)
+    net = js.Graph.from_edges(edges, n_nodes)
     flat = np.concatenate([points, np.zeros((n_nodes, 1))], axis=1)
     rest = np.linalg.norm(flat[edges[:, 1]] - flat[edges[:, 0]], axis=1)
     return _hung(net, flat, rest, rng, noise=0.01)
@@ -140,7 +140,7 @@ def bare_mesh(system: js.System, state: js.State, dt: Any, n_steps: int) -> tupl
     """Component arrays on the graph's own order, gathers and scatter-add, unguarded; and the arguments."""
     net, springs = system.net, springs_of(system)
     assert isinstance(net, js.Graph)
-    tails, heads = net.tails, net.heads
+    tails, heads = net.ends.tails, net.ends.heads
     k, l = (net.split(a).families[0] for a in (springs.stiffness, springs.rest_length))
 
     def run(x: Any, v: Any, k: Any, l: Any, dt: Any) -> Any:

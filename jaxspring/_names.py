@@ -139,6 +139,5 @@ PUBLIC: dict[str, dict[str, tuple[str, ...]]] = {
         "topology.edge_field": ("EdgeField",),
         "topology.base": ("Topology",),
         "topology.overlay": ("Overlay",),
-        "topology.reduction": ("Gather", "Scatter"),
     },
 }

@@ -185,8 +185,8 @@ BY_HAND = {"diffeqsolve", "fit", "check_gradient", "frequency_response", "from_n
 
 # What the library makes and hands out; nobody else builds it.
 MADE_INSIDE = """
-    Account Blocks BoundSystem Energy Equilibrium Finding Fit Gather GradientCheck History Iteration Memory Modes NodeDyads
-    OdeInfo OdeResult Overlay Profile Reconstructed Result Resume Scatter Scene Selection SkylineFactor SolveInfo Solves
+    Account Blocks BoundSystem Energy Equilibrium Finding Fit GradientCheck History Iteration Memory Modes NodeDyads
+    OdeInfo OdeResult Overlay Profile Reconstructed Result Resume Scene Selection SkylineFactor SolveInfo Solves
     SpringBlocks SpringMatrix Status Step Surface Undetermined
 """
 

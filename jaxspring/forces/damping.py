@@ -22,13 +22,13 @@ from ..numerics import cast_inexact, tiny
 from ..state import State
 from ..status import Flag
 from ..topology.base import Topology
-from ..topology.edge_field import EdgeField, SpringNumbers
+from ..topology.edge_field import EdgeField, SpringNumbers, ZeroOutside
 from ..vector import Vector
 from .base import Finding, Force, Scene, any_refused
 from .in_box import long_springs, turned_springs
 from .laws import has_no_direction
 from .lengths import beyond_range
-from .living import counted, living, map_living
+from .living import counted, heeding, living, map_living
 from .springs import _check_sign, _edge_constant
 
 
@@ -106,20 +106,22 @@ class Dashpots(Force):
 
     def bind(self, scene: Scene) -> Dashpots:
         """Constants as edge fields."""
-        return cast_inexact(eqx.tree_at(lambda f: f.damping, self, self.net.edge_field(self.damping)), scene.dtype)
+        damping = self.net.vanishing(cast_inexact(self.net.edge_field(self.damping), scene.dtype))
+        return cast_inexact(eqx.tree_at(lambda f: f.damping, self, damping), scene.dtype)
 
     def force(self, state: State) -> Vector:
         """Sum of the dampers' pulls at each node [N]; a spring of no length has no direction and no damping."""
         if self.net.n_springs == 0:
             return Vector.zeros_like(state.position)
 
-        def pull(d: Vector, relative: Vector, c: Array) -> Vector:
-            inverse = _inverse_length(d)
-            return (c * (d.dot(relative) * inverse) * inverse) * d
-
+        damping = self.net.edge_field(self.damping)
+        if not self.net.has_margins and not isinstance(damping, ZeroOutside):
+            damping = self.net.vanishing(damping)
+        if isinstance(damping, ZeroOutside):
+            pull, fields = heeding(self.net, state, _pull, damping)
+            return self.net.net_pull(pull, (state.position, state.velocity), *fields)
         d = self.net.difference(state.position)
-        pulls = map_living(self.net, state, pull, d, self._rate(state), self.net.edge_field(self.damping))
-        return self.net.accumulate(pulls)
+        return self.net.accumulate(map_living(self.net, state, _pull, d, self._rate(state), damping))
 
     def damping_blocks(self, state: State) -> Blocks | None:
         """Blocks c u u' per spring [N s/m], its direction taken as it is."""
@@ -175,6 +177,11 @@ class Dashpots(Force):
 
     def _rate(self, state: State) -> EdgeField:
         return self.net.unboxed().difference(state.velocity)
+
+
+def _pull(d: Vector, relative: Vector, c: Array) -> Vector:
+    inverse = _inverse_length(d)
+    return (c * (d.dot(relative) * inverse) * inverse) * d
 
 
 def _inverse_length(d: Vector) -> Array:

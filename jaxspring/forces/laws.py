@@ -31,7 +31,8 @@ class Law(eqx.Module):
     """Constitutive law of one spring. Abstract. All arguments of the methods broadcast against each other.
 
     Attributes:
-        is_finite_at_zero: whether weight, energy and their derivatives are finite at length zero (class attribute).
+        is_finite_at_zero: whether weight, energy and their derivatives are finite at length zero, and the weight is zero where the
+            stiffness is, so that it need not be masked where there is no spring (class attribute).
     """
 
     is_finite_at_zero: ClassVar[bool] = False

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
@@ -30,7 +31,12 @@ def living(net: Topology, state: State) -> EdgeField | None:
 def heeding(net: Topology, state: State, function: OfSprings, *fields: Any) -> tuple[OfSprings, tuple[Any, ...]]:
     """`function` of the fields of one family, and the fields, such that broken springs give zero. For `net_pull` and `map_springs`."""
     alive = living(net, state)
-    return (function, fields) if alive is None else (_of_living(function), (*fields, alive))
+    return (function, fields) if alive is None else (_OfLiving(function), (*fields, alive))
+
+
+def existing(net: Topology, function: OfSprings, *fields: Any) -> tuple[OfSprings, tuple[Any, ...]]:
+    """The same for a function that does not vanish of itself where there is no spring: for `net_pull` of a net without margins."""
+    return _OfLiving(function), (*fields, net.exists)
 
 
 def map_living(net: Topology, state: State, function: OfSprings, *fields: Any) -> EdgeField:
@@ -39,13 +45,15 @@ def map_living(net: Topology, state: State, function: OfSprings, *fields: Any) -
     return net.map_springs(function, *fields)
 
 
-def _of_living(function: OfSprings) -> OfSprings:
-    def of_family(*inputs: Any) -> Any:
-        *given, alive = inputs
-        found = function(*(_sound(a, alive) for a in given))
-        return jax.tree.map(lambda a: jnp.where(alive, a, jnp.zeros((), a.dtype)), found)
+class _OfLiving(eqx.Module):
+    """The function of the springs that hold."""
 
-    return of_family
+    function: OfSprings
+
+    def __call__(self, *inputs: Any) -> Any:
+        *given, alive = inputs
+        found = self.function(*(_sound(a, alive) for a in given))
+        return jax.tree.map(lambda a: jnp.where(alive, a, jnp.zeros((), a.dtype)), found)
 
 
 def _sound(a: Array | Vector, alive: Array) -> Array | Vector:
@@ -61,4 +69,4 @@ def counted(value: Array, constant: Array, alive: Array) -> Array:
     return jnp.where(alive, value, finite)
 
 
-__all__ = ["counted", "heeding", "living", "map_living"]
+__all__ = ["counted", "existing", "heeding", "living", "map_living"]

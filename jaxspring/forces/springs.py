@@ -33,7 +33,7 @@ from .in_box import along_axes, check_rest_length, long_springs, turned_springs
 from .laws import Hooke, Law, PowerLaw, TensionOnly, has_no_direction, length_of, spring_block, spring_energy, spring_pull
 from .lengths import beyond_range
 from .linearisation import Linearisation
-from .living import counted, heeding, living, map_living
+from .living import counted, existing, heeding, living, map_living
 
 
 class StiffnessRule(eqx.Module):
@@ -135,21 +135,26 @@ class Springs(Force):
         """Constants as edge fields."""
         rule = self.stiffness
         stiffness = rule.bind(self.net, scene.dtype) if isinstance(rule, StiffnessRule) else self.net.edge_field(rule, "stiffness")
-        if isinstance(stiffness, EdgeField):
-            # Pulls then vanish in a lattice's margins of themselves, and no step need mask them.
-            stiffness = ZeroOutside(self.net.inside(stiffness, 0).families)
-        ready = eqx.tree_at(lambda s: (s.stiffness, s.rest_length), self, (stiffness, self.net.edge_field(self.rest_length, "rest_length")))
-        return cast_inexact(ready, scene.dtype)
+        if not isinstance(stiffness, StiffnessRule):
+            # Pulls then vanish of themselves where there is no spring, and no step need mask them.
+            stiffness = self.net.vanishing(cast_inexact(stiffness, scene.dtype))
+        rest_length = self.net.at_ends(cast_inexact(self.net.edge_field(self.rest_length, "rest_length"), scene.dtype))
+        return cast_inexact(eqx.tree_at(lambda s: (s.stiffness, s.rest_length), self, (stiffness, rest_length)), scene.dtype)
 
     def force(self, state: State) -> Vector:
         """Sum of the pulls at each node [N]."""
         if self.net.n_springs == 0:
             return Vector.zeros_like(state.position)
-        pull = partial(spring_pull, self.law)
-        if isinstance(self.stiffness, ZeroOutside) and self.law.is_finite_at_zero:
-            pull, constants = heeding(self.net, state, pull, *self._constants(state))
-            return self._embed(self._near().net_pull(pull, self._seen(state), *constants), state)
-        return self._embed(self.net.accumulate(self._each(state, pull)), state)
+        k, l = self._constants(state)
+        if not self.net.has_margins and self.law.is_finite_at_zero and not isinstance(k, ZeroOutside):
+            k = self.net.vanishing(k)
+        vanishes = isinstance(k, ZeroOutside) and self.law.is_finite_at_zero
+        if self.net.has_margins and not vanishes:
+            return self._embed(self.net.accumulate(self._each(state, _Pull(self.law))), state)
+        pull, fields = heeding(self.net, state, _Pull(self.law), k, l)
+        if not vanishes:
+            pull, fields = existing(self.net, pull, *fields)
+        return self._embed(self._near().net_pull(pull, self._seen(state), *fields), state)
 
     def energy(self, state: State) -> Array | None:
         """Sum of the springs' energies [J]; None where the law has none."""
@@ -323,6 +328,15 @@ class Springs(Force):
         steepest = map_living(self.net, state, of_family, d, k, l)
         alive = living(self.net, state)
         return steepest if alive is None else self.net.map_springs(counted, steepest, k, alive)
+
+
+class _Pull(eqx.Module):
+    """The pulls of a law."""
+
+    law: Law
+
+    def __call__(self, d: Vector, stiffness: Array, rest_length: Array) -> Vector:
+        return spring_pull(self.law, d, stiffness, rest_length)
 
 
 def _edge_constant(net: Topology, name: str, value: Any) -> Any:

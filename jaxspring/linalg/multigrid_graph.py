@@ -214,7 +214,7 @@ def _as_arrays(springs: Springs) -> tuple[Array, Array]:
 def _ends(net: Topology) -> tuple[np.ndarray, np.ndarray]:
     """Tail and head of each spring, in the order of `_flat_blocks`, nodes as they are stored."""
     if isinstance(net, Graph):
-        return np.asarray(net.tails), np.asarray(net.heads)
+        return np.asarray(net.ends.tails), np.asarray(net.ends.heads)
     return net.edges[:, 0], net.edges[:, 1]
 
 

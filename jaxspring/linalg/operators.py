@@ -51,16 +51,16 @@ class SpringBlocks(eqx.Module):
     ):
         self.net = net
         # Nothing where a lattice keeps places of springs that do not exist: products then need no mask.
-        self.weight = net.inside(weight, 0)
-        self.slope = None if slope is None else net.inside(slope, 0)
-        self.direction = direction
+        self.weight = net.vanishing(weight)
+        self.slope = None if slope is None else net.vanishing(slope)
+        self.direction = None if direction is None else net.at_ends(direction)
         self.axes = axes
 
     def product(self, v: Vector) -> Vector:
         """D' B D v."""
         moving = v if self.axes is None else Vector(tuple(v[a] for a in self.axes))
         if self.slope is None or self.direction is None:
-            total = self.net.stiffness_product(lambda d, w: w * d, moving, self.weight)
+            total = self.net.stiffness_product(_weighted, moving, self.weight)
         else:
             total = self.net.stiffness_product(_block_product, moving, self.weight, self.slope, self.direction)
         return total if self.axes is None else _embedded(total, self.axes, v)
@@ -250,6 +250,10 @@ class SpringMatrix(eqx.Module):
 def isotropic(value: Any, like: Vector) -> Vector:
     """A node array (or number) on the diagonal of every coordinate, in node shape."""
     return like.map(lambda a: jnp.broadcast_to(jnp.asarray(value, a.dtype), a.shape))
+
+
+def _weighted(d: Vector, weight: Array) -> Vector:
+    return weight * d
 
 
 def _block_product(d: Vector, weight: Array, slope: Array, u: Vector) -> Vector:

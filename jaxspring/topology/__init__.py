@@ -10,8 +10,6 @@ if TYPE_CHECKING:  # written by `python -m tests.face`
     from .edge_field import EdgeField as EdgeField
     from .base import Topology as Topology
     from .overlay import Overlay as Overlay
-    from .reduction import Gather as Gather
-    from .reduction import Scatter as Scatter
     from .lattice import BEND as BEND
     from .lattice import BODY as BODY
     from .lattice import SHEAR as SHEAR

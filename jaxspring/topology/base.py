@@ -25,7 +25,7 @@ from .. import printing
 from .._arrays import Edges, Numbers, own
 from .._checks import as_inexact, finite, has_shape, shape_of
 from ..vector import Vector
-from .edge_field import EdgeField, SpringNumbers
+from .edge_field import EdgeField, SpringNumbers, ZeroOutside
 from .identity import NetIdentity
 from .periods import box_of, check_dim
 from .permutation import Permutation
@@ -106,9 +106,34 @@ class Topology(eqx.Module):
     def accumulate(self, pulls: EdgeField) -> Vector:
         """Force on each node from the pull of each spring: plus on its tail, minus on its head."""
 
-    def net_pull(self, pull: Callable[..., Vector], x: Vector, *fields: Any) -> Vector:
-        """Sum of the pulls at each node, `pull(D x, *fields)` family by family, where a pull vanishes for springs that do not exist."""
-        return self.accumulate(self.map_springs(pull, self.difference(x), *fields))
+    @abc.abstractmethod
+    def net_pull(self, pull: Callable[..., Vector], x: Vector | tuple[Vector, ...], *fields: Any) -> Vector:
+        """Sum of the pulls at each node, `pull(D x, *fields)`.
+
+        Args:
+            pull: of the springs of a family, or of some of a list: odd in the differences, and zero for springs that do not exist. Where
+                there are derivatives by its own constants, a module that holds them.
+            x: what differences are taken of, the nearest images of the first; or several `Vector`s.
+            fields: what else a pull takes: numbers, and edge fields whose values do not change their sign with a spring's direction.
+        """
+
+    def at_ends(self, field: Array | EdgeField) -> Array | EdgeField:
+        """The field as `net_pull` reads it, made once for many steps."""
+        return field
+
+    def vanishing(self, field: Array | EdgeField) -> Array | EdgeField:
+        """The same, zero at places that are kept for springs that do not exist. Where it is one number for all springs it may stay."""
+        return ZeroOutside(self.inside(field, 0).families, field.identity) if isinstance(field, EdgeField) else field
+
+    @property
+    def exists(self) -> Any:
+        """Where `net_pull` finds a spring, as one of its fields; of a net without margins."""
+        raise NotImplementedError
+
+    @property
+    def has_margins(self) -> bool:
+        """Whether edge fields have places for springs that do not exist."""
+        return True
 
     def stiffness_product(self, block: Callable[..., Vector], v: Vector, *fields: EdgeField) -> Vector:
         """D' B D v, where `block(d, *fields of a family)` is B d and vanishes where no spring exists; periods do not wrap `v`."""

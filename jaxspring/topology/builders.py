@@ -13,20 +13,17 @@ import numpy as np
 from .._arrays import Numbers, given, on_host
 from .._checks import finite, triangle_indices
 from .graph import Graph
-from .reduction import Gather, Scatter
 
-Reductions = type[Gather] | type[Scatter] | None
 # How many roundings of a coordinate may lie between a node and the line of its neighbours on a straight border.
 ROUNDING = 8
 
 
-def from_triangles(triangles: Numbers, n_nodes: int, *, reduction: Reductions = None) -> Graph:
+def from_triangles(triangles: Numbers, n_nodes: int) -> Graph:
     """A spring along every side of every triangle, one per side; the triangles are kept as `net.triangles`.
 
     Args:
         triangles: (T, 3) integer node numbers.
         n_nodes: number of nodes N; a node in no triangle gets no spring.
-        reduction: see `Graph.from_edges`.
 
     Returns:
         A `Graph` whose springs are sorted by their lower, then their higher node.
@@ -40,15 +37,14 @@ def from_triangles(triangles: Numbers, n_nodes: int, *, reduction: Reductions = 
     (5, (2, 3))
     """
     corners = triangle_indices("triangles", triangles, n_nodes)
-    return Graph.from_edges(_sides(corners), n_nodes, triangles=corners, reduction=reduction)
+    return Graph.from_edges(_sides(corners), n_nodes, triangles=corners)
 
 
-def delaunay(points: Numbers, *, reduction: Reductions = None) -> Graph:
+def delaunay(points: Numbers) -> Graph:
     """Springs along the Delaunay triangulation of points in the plane, or tetrahedralisation of points in space.
 
     Args:
         points: (N, 2) or (N, 3) positions [m].
-        reduction: see `Graph.from_edges`.
 
     Returns:
         A `Graph` on all N points. `net.triangles` holds the triangles; in space, those of the convex hull.
@@ -83,16 +79,15 @@ def delaunay(points: Numbers, *, reduction: Reductions = None) -> Graph:
         raise ValueError(flat) from error
     _refuse_doubled(local, found.coplanar[:, 0], found.coplanar[:, 2])
     simplices, surface = _without_slivers(local, found.simplices, found.neighbors, rounding)
-    return Graph.from_edges(_sides(simplices), n_nodes, triangles=simplices if dim == 2 else surface, reduction=reduction)
+    return Graph.from_edges(_sides(simplices), n_nodes, triangles=simplices if dim == 2 else surface)
 
 
-def from_scipy(matrix: Any, *, reduction: Reductions = None) -> tuple[Graph, np.ndarray]:
+def from_scipy(matrix: Any) -> tuple[Graph, np.ndarray]:
     """A network from a symmetric adjacency matrix: one spring per stored pair i < j.
 
     Args:
         matrix: (N, N) sparse or dense, symmetric, with an empty diagonal; an entry is a weight, e.g. a stiffness [N/m]. In a sparse matrix
             a zero that is stored is a spring of weight zero, on whichever side of the diagonal it is; entries stored twice are summed.
-        reduction: see `Graph.from_edges`.
 
     Returns:
         `(net, weights)`: a `Graph` and the (E,) weight of each spring in float64, in the order of `net.edges`.
@@ -131,18 +126,15 @@ def from_scipy(matrix: Any, *, reduction: Reductions = None) -> tuple[Graph, np.
     keep = both[:, 0] < both[:, 1]
     # Where both sides are stored they are equal: the first will do.
     edges, first = np.unique(both[keep], axis=0, return_index=True)
-    return Graph.from_edges(edges, matrix.shape[0], reduction=reduction), stored.data[keep][first]
+    return Graph.from_edges(edges, matrix.shape[0]), stored.data[keep][first]
 
 
-def from_networkx(
-    graph: Any, attributes: tuple[str, ...] = (), *, reduction: Reductions = None
-) -> tuple[Graph, list[Hashable], tuple[np.ndarray, ...]]:
+def from_networkx(graph: Any, attributes: tuple[str, ...] = ()) -> tuple[Graph, list[Hashable], tuple[np.ndarray, ...]]:
     """A network from an undirected NetworkX graph: one spring per edge, parallel edges included.
 
     Args:
         graph: `networkx.Graph` or `MultiGraph`.
         attributes: names of edge attributes to read, e.g. `("stiffness", "rest_length")`; a single name is one attribute.
-        reduction: see `Graph.from_edges`.
 
     Returns:
         `(net, labels, values)`: a `Graph`, the label of each node in the order of the net's nodes, and one (E,) array per attribute
@@ -170,7 +162,7 @@ def from_networkx(
     for name in (attributes,) if isinstance(attributes, str) else tuple(attributes):
         values.append(np.array([_attribute(name, *edge) for edge in edges], float))
     pairs = [(number[tail], number[head]) for tail, head, _ in edges]
-    return Graph.from_edges(pairs, len(labels), reduction=reduction), labels, tuple(values)
+    return Graph.from_edges(pairs, len(labels)), labels, tuple(values)
 
 
 def _attribute(name: str, tail: Hashable, head: Hashable, data: dict[Any, Any]) -> float:

@@ -127,5 +127,20 @@ def with_field(net: Any, fields: OfNets, field: EdgeField) -> OfNets:
     return new[0] if len(new) == 1 else new
 
 
-class ZeroOutside(EdgeField):
-    """An edge field that is zero where a lattice keeps places of springs that do not exist; arithmetic gives a plain `EdgeField`."""
+class AtEnds(EdgeField):
+    """An edge field as `net_pull` reads it: on a graph with each spring's value at both of its ends too. Made by `net.at_ends`.
+
+    Attributes:
+        ends: the values at the entries of `ends.py`, class by class; none on a lattice.
+    """
+
+    ends: tuple[Any, ...] = ()
+
+    def map(self, function: Callable[..., Any], *others: EdgeField) -> EdgeField:
+        """As of an edge field; at the ends too, unless there are other fields."""
+        plain = super().map(function, *others)
+        return plain if others or not self.ends else AtEnds(plain.families, plain.identity, tuple(function(entry) for entry in self.ends))
+
+
+class ZeroOutside(AtEnds):
+    """The same, and zero at places that are kept for springs that do not exist: made by `net.vanishing`."""

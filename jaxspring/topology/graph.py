@@ -1,38 +1,31 @@
 """Irregular networks: any list of springs between nodes.
 
 Nodes and springs are renumbered inside, so that what is read together lies together; the user's numbering is kept outside. A node field
-has shape (N,), an edge field holds one entry of shape (E,). How pulls are summed on nodes is an object, `Gather` or `Scatter`: see
-`reduction.py`.
+has shape (N,), an edge field holds one entry of shape (E,). How each node reads its springs: see `ends.py`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array
 
 from .._arrays import Edges, Numbers, whole_number
 from .._checks import node_indices, triangle_indices
-from ..vector import Vector
-from .edge_field import EdgeField
+from .ends import Ends
 from .listed import ListedSprings, arranged, digest_of
 from .overlay import Overlay
-from .periods import as_box, minimum_image
+from .periods import as_box
 from .permutation import Permutation
-from .reduction import Gather, Reduction, Scatter, choose_reduction
 
 
 class Graph(ListedSprings):
     """Nodes joined by an arbitrary list of springs. Build it with `Graph.from_edges`, `delaunay` or `from_triangles`.
 
     Attributes:
-        tails: (E,) internal number of each spring's tail node.
-        heads: (E,) internal number of each spring's head node.
-        reduction: how pulls are summed on nodes.
+        ends: the springs as each node reads them.
         box: (D,) period of each coordinate [m], or None.
         triangles: (T, 3) triangles in the user's numbering, or None.
         count: N (static).
@@ -42,9 +35,7 @@ class Graph(ListedSprings):
         name: tells it from other nets of the same springs, or None: see `named`.
     """
 
-    tails: Int[Array, " E"]
-    heads: Int[Array, " E"]
-    reduction: Reduction
+    ends: Ends
     box: Array | None
     triangles: np.ndarray | None
     count: int = eqx.field(static=True)
@@ -60,7 +51,6 @@ class Graph(ListedSprings):
         *,
         box: Numbers | None = None,
         triangles: Numbers | None = None,
-        reduction: type[Gather] | type[Scatter] | None = None,
     ) -> Graph:
         """A network from an (E, 2) integer array: tail and head node of each spring. Springs may be repeated.
 
@@ -69,8 +59,6 @@ class Graph(ListedSprings):
             n_nodes: number of nodes N; a node without a spring is allowed.
             box: (D,) period of each coordinate [m]; zero where a coordinate is not periodic.
             triangles: (T, 3) triangles, kept for plots and surfaces.
-            reduction: `Gather` (no scatter in any program) or `Scatter`, which compiles sooner; see `docs/benchmarks.md` for their speed.
-                None takes `Gather`, but `Scatter` on a CPU for more nodes than `FASTER_BY_SCATTER`.
 
         Raises:
             ValueError: no node, a node that does not exist, a spring that joins a node to itself, a triangle with a corner twice, a period
@@ -85,12 +73,9 @@ class Graph(ListedSprings):
         if n_nodes < 1:
             raise ValueError(f"n_nodes = {n_nodes}, but a network needs at least 1 node.")
         pairs = node_indices("edges", edges, n_nodes)
-        kind = choose_reduction(n_nodes) if reduction is None else reduction
-        tails, heads, sums, order, springs = arranged(pairs, n_nodes, kind)
+        ends, order, springs = arranged(pairs, n_nodes)
         return Graph(
-            tails=jnp.asarray(tails),
-            heads=jnp.asarray(heads),
-            reduction=sums,
+            ends=ends,
             box=as_box(box),
             triangles=None if triangles is None else _as_triangles(triangles, n_nodes),
             count=n_nodes,
@@ -119,25 +104,11 @@ class Graph(ListedSprings):
         """A further net over the same nodes: see `Topology.with_edges`."""
         return Overlay.on(self.layout, self.box, edges, name)
 
-    def difference(self, x: Vector) -> EdgeField:
-        """Head minus tail along each spring."""
-        d = self._per_array(self.reduction.difference, x)
-        return self.own((d if self.box is None else minimum_image(d, self.box),))
+    def _taken(self, a: Array) -> Array:
+        return a
 
-    def accumulate(self, pulls: EdgeField) -> Vector:
-        """Force on each node: each pull on its tail, the opposite on its head."""
-        return self._per_array(self.reduction.accumulate, pulls.families[0])
-
-    def incident_sum(self, values: EdgeField) -> Array:
-        """Sum over the springs at each node."""
-        return self.reduction.sum_at_nodes(values.families[0], self.tails, self.heads)
-
-    def average(self, a: Array) -> EdgeField:
-        """Mean of a node array over the two ends of each spring."""
-        return self.own((self.reduction.mean_of_ends(a, self.tails, self.heads),))
-
-    def _per_array(self, function: Callable[[Array, Array, Array], Array], v: Vector) -> Vector:
-        return v.map(lambda a: function(a, self.tails, self.heads))
+    def _put(self, a: Array) -> Array:
+        return a
 
 
 def _as_triangles(triangles: Any, n_nodes: int) -> np.ndarray:

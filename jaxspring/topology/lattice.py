@@ -156,15 +156,18 @@ class Lattice(Topology):
         columns = zip(*(pull.components for pull in pulls.families), strict=True)
         return -Vector(tuple(linear_call(forward, backward, (), tuple(column)) for column in columns))
 
-    def net_pull(self, pull: Callable[..., Vector], x: Vector, *fields: Any) -> Vector:
+    def net_pull(self, pull: Callable[..., Vector], x: Vector | tuple[Vector, ...], *fields: Any) -> Vector:
         """Sum of the pulls at each node without masks, since pulls vanish in the margins."""
+        moving = x if isinstance(x, tuple) else (x,)
         if not self.offsets:
-            return Vector.zeros_like(x)
+            return Vector.zeros_like(moving[0])
         apart, together = partial(_difference_anywhere, self.grid_shape), partial(_minus_accumulate_anywhere, self.grid_shape)
-        columns = [linear_call(apart, together, (), a) for a in x]
-        families = (Vector(parts) for parts in zip(*columns, strict=True))
-        d = self.own(families if self.box is None else (minimum_image(d, self.box) for d in families))
-        pulls = self.map_springs(pull, d, *fields)
+        differences = []
+        for i, v in enumerate(moving):
+            columns = [linear_call(apart, together, (), a) for a in v]
+            families = (Vector(parts) for parts in zip(*columns, strict=True))
+            differences.append(self.own(families if i or self.box is None else (minimum_image(d, self.box) for d in families)))
+        pulls = self.map_springs(pull, *differences, *fields)
         back = zip(*(p.components for p in pulls.families), strict=True)
         return -Vector(tuple(linear_call(together, apart, (), tuple(column)) for column in back))
 

@@ -6,26 +6,28 @@ outside.
 
 from __future__ import annotations
 
+import abc
 import hashlib
+from collections.abc import Callable
 from typing import Any, Self
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from .base import Topology
-from .edge_field import EdgeField
+from .edge_field import AtEnds, EdgeField, ZeroOutside
+from .ends import Ends, Spread
 from .identity import NetIdentity
+from .periods import minimum_image
 from .permutation import Permutation, locality_order
-from .reduction import Reduction
 
 
 class ListedSprings(Topology):
     """A topology whose springs are one list. Abstract: see `Graph` and `Overlay`."""
 
-    tails: eqx.AbstractVar[Array]
-    heads: eqx.AbstractVar[Array]
-    reduction: eqx.AbstractVar[Reduction]
+    ends: eqx.AbstractVar[Ends]
     box: eqx.AbstractVar[Array | None]
     springs: eqx.AbstractVar[Permutation]
     digest: eqx.AbstractVar[str]
@@ -49,7 +51,66 @@ class ListedSprings(Topology):
 
     def _ends(self) -> np.ndarray:
         """(E, 2) places of tail and head, on the host."""
-        return np.stack([of_one(self.tails), of_one(self.heads)], axis=-1)
+        return np.stack([of_one(self.ends.tails), of_one(self.ends.heads)], axis=-1)
+
+    @abc.abstractmethod
+    def _taken(self, a: Array) -> Array:
+        """Node array -> the nodes that have springs here."""
+
+    @abc.abstractmethod
+    def _put(self, a: Array) -> Array:
+        """The nodes that have springs here -> node array."""
+
+    def difference(self, x: Vector) -> EdgeField:
+        """Head minus tail along each spring."""
+        d = x.map(lambda a: self.ends.difference(self._taken(a)))
+        return self.own((d if self.box is None else minimum_image(d, self.box),))
+
+    def accumulate(self, pulls: EdgeField) -> Vector:
+        """Force on each node: each pull on its tail, the opposite on its head; zero on nodes without springs."""
+        return pulls.families[0].map(lambda p: self._put(self.ends.accumulate(p)))
+
+    def net_pull(self, pull: Callable[..., Vector], x: Vector | tuple[Vector, ...], *fields: Any) -> Vector:
+        """Sum of the pulls at each node, each spring taken at both of its ends; `pull` is odd in the differences."""
+        moving = x if isinstance(x, tuple) else (x,)
+        if self.n_springs == 0:
+            return Vector.zeros_like(moving[0])
+        whole = pull if self.box is None else _Wrapped(pull, self.box)
+        pulls = self.ends.net_pull(whole, [v.map(self._taken) for v in moving], [self._spread_out(field) for field in fields])
+        return pulls.map(self._put)
+
+    def at_ends(self, field: Array | EdgeField) -> Array | EdgeField:
+        """An edge field that each step reads, spread over both ends of each spring once; one number stays."""
+        return AtEnds(field.families, field.identity, self._spread_out(field)) if isinstance(field, EdgeField) else field
+
+    def vanishing(self, field: Array | EdgeField) -> ZeroOutside:
+        """The same, zero at places of no spring."""
+        full = self._spread(field) if isinstance(field, EdgeField) else self.own((jnp.broadcast_to(field, (self.n_springs,)),))
+        return ZeroOutside(full.families, full.identity, self.ends.spread(full.families[0], vanishing=True))
+
+    @property
+    def exists(self) -> AtEnds:
+        """Which entries are of a spring, as a field of `net_pull`."""
+        real = self.ends.real
+        return AtEnds((), self.identity, tuple(jnp.ones((), bool) if real is None else one.rows(real) for one in self.ends.classes))
+
+    def _spread_out(self, field: Any) -> Spread | Array:
+        if isinstance(field, AtEnds):
+            return field.ends
+        return self.ends.spread(self._spread(field).families[0]) if isinstance(field, EdgeField) else field
+
+    def incident_sum(self, values: EdgeField) -> Array:
+        """Sum over the springs at each node."""
+        return self._put(self.ends.sum_at_nodes(values.families[0]))
+
+    def average(self, a: Array) -> EdgeField:
+        """Mean of a node array over the two ends of each spring."""
+        return self.own((self.ends.mean_of_ends(self._taken(a)),))
+
+    @property
+    def has_margins(self) -> bool:
+        """A list has no place for a spring that does not exist."""
+        return False
 
     def unboxed(self) -> Self:
         """The same springs without periods."""
@@ -68,26 +129,25 @@ class ListedSprings(Topology):
         return self.springs.outward(field.families[0])
 
 
-def arranged(pairs: np.ndarray, n_nodes: int, reduction: Any) -> tuple[np.ndarray, np.ndarray, Reduction, np.ndarray, Permutation]:
-    """How the springs between these pairs of nodes are kept.
+class _Wrapped(eqx.Module):
+    """A pull of the nearest images."""
 
-    Args:
-        pairs: (E, 2) tail and head of each spring.
-        n_nodes: number of nodes.
-        reduction: `Gather` or `Scatter`.
+    pull: Callable[..., Vector]
+    box: Array
 
-    Returns:
-        Tails and heads in the order of the springs and the numbering in which they are kept, how pulls are summed, the given number of
-        each node that is kept, and the order of the springs.
+    def __call__(self, d: Vector, *others: Any) -> Vector:
+        return self.pull(minimum_image(d, self.box), *others)
+
+
+def arranged(pairs: np.ndarray, n_nodes: int) -> tuple[Ends, np.ndarray, Permutation]:
+    """How the springs between these (E, 2) pairs of nodes are kept: their ends, the given number of each node that is kept, and the order
+    of the springs.
     """
     near = locality_order(pairs, n_nodes)
     inner = np.argsort(near)[pairs]
     springs = Permutation(np.lexsort((inner.max(axis=1), inner.min(axis=1))))
-    tails, heads = inner[springs.order].T
-    sums, order = reduction.build(tails, heads, n_nodes)
-    nodes = near[order]
-    tails, heads = np.argsort(nodes).astype(np.int32)[pairs[springs.order]].T
-    return tails, heads, sums, nodes, springs
+    ends, order = Ends.build(inner[springs.order], n_nodes)
+    return ends, near[order], springs
 
 
 def of_one(table: Array) -> np.ndarray:

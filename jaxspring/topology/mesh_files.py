@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from .._checks import constant, is_concrete
-from .builders import Reductions
 from .graph import Graph
 from .mesh_text import READERS, RawMesh, raw_mesh
 from .polygons import CrossedPolygonError, triangulate
@@ -25,7 +24,7 @@ ROUNDED = (1e-7, 1e-6, 1e-5)
 NEEDED = {".3mf": "lxml", ".dae": "pycollada", ".ctm": "python-openctm", ".step": "cascadio", ".stp": "cascadio", ".xaml": "lxml"}
 
 
-def from_mesh(path: str | pathlib.Path, *, merge: float | None = None, reduction: Reductions = None) -> tuple[Graph, np.ndarray]:
+def from_mesh(path: str | pathlib.Path, *, merge: float | None = None) -> tuple[Graph, np.ndarray]:
     """A network from a surface mesh file: OBJ, OFF and PLY; STL, GLB and what else trimesh reads with the extra `mesh`.
 
     A spring joins the ends of every side of every triangle, and of every line (OBJ) or edge (PLY), once. Faces of more corners are cut into
@@ -36,7 +35,6 @@ def from_mesh(path: str | pathlib.Path, *, merge: float | None = None, reduction
         path: the file.
         merge: vertices nearer than this share of the mesh's size (the diagonal of its box) become one node. None and 0 merge those at
             exactly one place.
-        reduction: see `Graph.from_edges`.
 
     Returns:
         `(net, points)`: a `Graph` with the file's triangles, and the (N, 3) positions of its nodes in the file's unit of length. Nodes and
@@ -65,9 +63,7 @@ def from_mesh(path: str | pathlib.Path, *, merge: float | None = None, reduction
         raise ValueError(f"{path} holds neither a face nor a line, so there is nothing to make springs of.")
     points, triangles, lines = _merged(path, raw, 0.0 if merge is None else float(merge))
     edges = np.concatenate([lines, triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [0, 2]]])
-    net = Graph.from_edges(
-        np.unique(np.sort(edges, axis=1), axis=0), len(points), triangles=triangles if len(triangles) else None, reduction=reduction
-    )
+    net = Graph.from_edges(np.unique(np.sort(edges, axis=1), axis=0), len(points), triangles=triangles if len(triangles) else None)
     _tell_pieces(path, net.edges, points, merge)
     return net, points
 

@@ -19,13 +19,10 @@ from jaxtyping import Array, Int
 from .._arrays import Edges
 from .._checks import node_indices
 from ..numerics import linear_call
-from ..vector import Vector
 from .base import NodeLayout
-from .edge_field import EdgeField
+from .ends import Ends
 from .listed import ListedSprings, arranged, digest_of, of_one
-from .periods import minimum_image
 from .permutation import Permutation
-from .reduction import Reduction, choose_reduction
 
 # Nodes per touched node from which on writing to the touched ones is faster than having every node read.
 SPARSE = 8
@@ -37,9 +34,7 @@ class Overlay(ListedSprings):
     """Springs over the nodes of another net. Build it with `net.with_edges`.
 
     Attributes:
-        tails: (E,) tail of each spring among the touched nodes, in the order in which they are kept.
-        heads: (E,) head of each.
-        reduction: how pulls are summed on the touched nodes.
+        ends: the springs as each of the touched nodes reads them.
         where: (T,) places of the touched nodes in a flat node array.
         back: (N,) for each node its place among the touched ones, or T; None where few nodes are touched.
         box: (D,) period of each coordinate [m], or None.
@@ -49,9 +44,7 @@ class Overlay(ListedSprings):
         name: tells it from other nets of the same springs, or None (static).
     """
 
-    tails: Int[Array, " E"]
-    heads: Int[Array, " E"]
-    reduction: Reduction
+    ends: Ends
     where: Int[Array, " T"]
     back: Int[Array, " N"] | None
     box: Array | None
@@ -70,15 +63,13 @@ class Overlay(ListedSprings):
         if not len(touched):
             touched = np.zeros(1, int)  # arrays of no length compile nowhere
         local = local.reshape(-1, 2)
-        tails, heads, sums, order, springs = arranged(local, len(touched), choose_reduction(len(touched)))
+        ends, order, springs = arranged(local, len(touched))
         where = touched[order].astype(np.int32)
         back = np.full(count, len(touched), np.int32)
         back[where] = np.arange(len(touched), dtype=np.int32)
         reads = len(touched) * SPARSE >= count
         return Overlay(
-            tails=jnp.asarray(tails),
-            heads=jnp.asarray(heads),
-            reduction=sums,
+            ends=ends,
             where=jnp.asarray(where),
             back=jnp.asarray(back) if reads else None,
             box=box,
@@ -108,23 +99,6 @@ class Overlay(ListedSprings):
     def with_edges(self, edges: Edges, name: str | None = None) -> Overlay:
         """A further net over the same nodes: see `Topology.with_edges`."""
         return Overlay.on(self.layout, self.box, edges, name)
-
-    def difference(self, x: Vector) -> EdgeField:
-        """Head minus tail along each spring."""
-        d = x.map(lambda a: self.reduction.difference(self._taken(a), self.tails, self.heads))
-        return self.own((d if self.box is None else minimum_image(d, self.box),))
-
-    def accumulate(self, pulls: EdgeField) -> Vector:
-        """Force on each node: each pull on its tail, the opposite on its head; zero on nodes that no spring touches."""
-        return pulls.families[0].map(lambda p: self._put(self.reduction.accumulate(p, self.tails, self.heads)))
-
-    def incident_sum(self, values: EdgeField) -> Array:
-        """Sum over the springs at each node."""
-        return self._put(self.reduction.sum_at_nodes(values.families[0], self.tails, self.heads))
-
-    def average(self, a: Array) -> EdgeField:
-        """Mean of a node array over the two ends of each spring."""
-        return self.own((self.reduction.mean_of_ends(self._taken(a), self.tails, self.heads),))
 
     def _taken(self, a: Array) -> Array:
         """Node array -> (T,)."""

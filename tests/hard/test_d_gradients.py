@@ -151,11 +151,11 @@ STEPPERS = [js.ForwardEuler(), js.SymplecticEuler(), js.VelocityVerlet(), js.Run
 
 
 # Every stepper on every topology in float64; float32 once on each topology.
-CASES = [(stepper, kind, "float64") for stepper in STEPPERS for kind in ("lattice", "gather", "scatter")]
+CASES = [(stepper, kind, "float64") for stepper in STEPPERS for kind in ("lattice", "graph")]
 CASES += [
     (js.SymplecticEuler(), "lattice", "float32"),
-    (js.VelocityVerlet(), "gather", "float32"),
-    (js.RungeKutta4(), "scatter", "float32"),
+    (js.VelocityVerlet(), "graph", "float32"),
+    (js.RungeKutta4(), "graph", "float32"),
 ]
 
 
@@ -164,7 +164,7 @@ def test_d8_dot_test(rng, stepper, kind, dtype):
     """<J u, w> = <u, J' w> for a step of every stepper, with random u and w: 1e-12 in float64, 1e-4 in float32."""
     net = js.lattice((4, 5))
     if kind != "lattice":
-        net = js.Graph.from_edges(net.edges, 20, reduction=js.topology.Gather if kind == "gather" else js.topology.Scatter)
+        net = js.Graph.from_edges(net.edges, 20)
 
     def step(inputs):
         x, v, k, l, mass, gamma, dt = inputs
@@ -253,7 +253,7 @@ def test_d9_every_parameter(scene, name):
 
 def test_d11_models_with_whole_numbers():
     """eqx.filter_grad differentiates a system that holds integer tables; plain jax.grad refuses it with an error that names the dtype."""
-    net = js.Graph.from_edges([(0, 1), (1, 2)], 3, reduction=js.topology.Gather)
+    net = js.Graph.from_edges([(0, 1), (1, 2)], 3)
     system = js.System(net, 1.0, js.Springs(net, [1.0, 2.0], 1.0))
     state = js.State.from_points(net, [[0.0], [2.0], [5.0]])
 

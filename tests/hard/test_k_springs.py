@@ -593,7 +593,7 @@ def instances():
             TWO,
             WHOLE,
         ),
-        *(WHOLE.reduction, js.Graph.from_edges([(0, 1)], 2, reduction=js.topology.Scatter).reduction, js.lattice((3, 3)).named("second")),
+        js.lattice((3, 3)).named("second"),
         *(
             js.Energy(number, (None,)),
             js.Finding(js.Flag.OUTSIDE, whole, whole),

@@ -14,7 +14,7 @@ SQUARE = RNG.random((30, 2))
 BASES = {
     "lattice": js.lattice((5, 6)),
     "graph": js.delaunay(SQUARE),
-    "scatter": js.Graph.from_edges([(0, 1)], 30, reduction=js.topology.Scatter),
+    "few": js.Graph.from_edges([(0, 1)], 30),
 }
 SEAM = np.array([[0, 29], [7, 22], [29, 3]])
 MANY = np.array([p for p in RNG.integers(0, 30, (80, 2)) if p[0] != p[1]])

@@ -24,11 +24,10 @@ NETS = {
     "block": lambda: js.lattice((3, 4, 3), springs=js.STRUCTURAL + js.SHEAR + js.BODY + js.BEND),
     "torus": lambda: js.lattice((5, 4), springs=js.STRUCTURAL + js.SHEAR, periodic=True, box=BOX),
     "tube": lambda: js.lattice((5, 4), springs=js.STRUCTURAL + js.SHEAR, periodic=(True, False), box=(0.0, 5.0)),
-    "gather": lambda: js.Graph.from_edges(random_edges(12, 30), 13, reduction=js.topology.Gather),  # node 12 has no spring
-    "scatter": lambda: js.Graph.from_edges(random_edges(12, 30), 13, reduction=js.topology.Scatter),
+    "graph": lambda: js.Graph.from_edges(random_edges(12, 30), 13),  # node 12 has no spring
     "hub": lambda: js.Graph.from_edges([*random_edges(30, 90), *[(i % 29, 29) for i in range(40)]], 31),  # node 30 has no spring
-    "star": lambda: js.Graph.from_edges([(0, i) for i in range(1, 300)], 300, reduction=js.topology.Gather),
-    "double": lambda: js.Graph.from_edges([(0, 1), (0, 1), (1, 0), (1, 2)], 3, reduction=js.topology.Gather),
+    "star": lambda: js.Graph.from_edges([(0, i) for i in range(1, 300)], 300),
+    "double": lambda: js.Graph.from_edges([(0, 1), (0, 1), (1, 0), (1, 2)], 3),
     "single": lambda: js.lattice((1, 3)),
 }
 each_net = pytest.mark.parametrize("net", [make() for make in NETS.values()], ids=NETS.keys())
@@ -175,44 +174,28 @@ def test_gradients_of_averages(net, rng):
     np.testing.assert_allclose(by_springs, ends @ a, atol=1e-13)
 
 
-def test_gather_and_scatter_agree():
-    """The two reductions give the same forces and gradients."""
-    edges, rng = random_edges(40, 200), np.random.default_rng(0)
-    points, k = rng.normal(size=(40, 3)), jnp.asarray(rng.uniform(1, 2, 200))
-
-    def energy(k, points, kind):
-        net = js.Graph.from_edges(edges, 40, reduction=kind)
-        return js.Springs(net, k, 0.5).energy(js.State.from_points(net, points))
-
-    gather, scatter = (
-        jax.jit(jax.grad(lambda k, x, kind=kind: energy(k, x, kind), argnums=(0, 1)))(k, points)
-        for kind in (js.topology.Gather, js.topology.Scatter)
-    )
-    for a, b in zip(gather, scatter, strict=True):
-        np.testing.assert_allclose(a, b, atol=1e-12)
-
-
 def test_tables_of_a_large_graph(rng):
-    """With several tables and a further round, sums are those of bincount; each node is summed once, only hubs in the further round."""
-    net = js.Graph.from_edges(random_edges(4000, 14_000), 4000)
+    """With several classes and hubs, sums are those of bincount; an end of a spring stands in one place; only hubs have several columns."""
+    edges = np.concatenate([random_edges(4000, 14_000), [(0, i) for i in range(1, 1500)], [(1, i) for i in range(2, 60)]])
+    net = js.Graph.from_edges(edges, 4000)
     tail, head = net.edges.T
-    degree = np.bincount(net.edges.ravel(), minlength=4000)
-    first, further = ([len(table) for table in tables] for tables in net.reduction.whole)
-    assert len(first) > 1
-    assert (sum(first), sum(further)) == (np.sum(degree <= 16), np.sum(degree > 16))
-    assert sum(further) > 0
+    degree, ends = np.bincount(net.edges.ravel(), minlength=4000), net.ends
+    assert [one.is_hubs for one in ends.classes] == [False] * (len(ends.classes) - 1) + [True]
+    assert len(ends.classes) > 3
+    assert sum(one.count for one in ends.classes[:-1]) == np.sum((degree > 0) & (degree <= 32))
+    assert len(np.unique(ends.classes[-1].rows(ends.owners))) == np.sum(degree > 32)
+    np.testing.assert_array_equal(np.sort(np.asarray(ends.entries)[np.asarray(ends.real)]), np.arange(2 * len(edges)))
     p = rng.normal(size=net.n_springs)
     got = jax.jit(lambda p: accumulate(net, p))(p)
-    np.testing.assert_allclose(got, np.bincount(tail, p, 4000) - np.bincount(head, p, 4000), atol=1e-13)
+    np.testing.assert_allclose(got, np.bincount(tail, p, 4000) - np.bincount(head, p, 4000), atol=1e-12)
 
 
-@pytest.mark.parametrize("reduction", [js.topology.Gather, js.topology.Scatter])
-def test_two_springs_on_a_pair_add_up(reduction):
+def test_two_springs_on_a_pair_add_up():
     """Two springs of 50 N/m between the same nodes pull as one of 100 N/m, to the bit; opposite directions to round-off."""
     points = np.array([[0.1, 0.2, 0.3], [1.3, 0.9, 0.2]])
 
     def force(edges, k):
-        net = js.Graph.from_edges(edges, 2, reduction=reduction)
+        net = js.Graph.from_edges(edges, 2)
         state = js.State.from_points(net, points)
         f = js.Springs(net, k, 0.5).force(state)
         return np.stack([net.flatten_nodes(a) for a in f])

@@ -28,7 +28,7 @@ from .base import Finding, Force, Scene, any_refused
 from .in_box import long_springs, turned_springs
 from .laws import has_no_direction
 from .lengths import beyond_range
-from .living import counted, heeding, living, map_living
+from .living import counted, heeding, living, map_living, vanishing
 from .springs import _check_sign, _edge_constant
 
 
@@ -106,7 +106,7 @@ class Dashpots(Force):
 
     def bind(self, scene: Scene) -> Dashpots:
         """Constants as edge fields."""
-        damping = self.net.vanishing(cast_inexact(self.net.edge_field(self.damping), scene.dtype))
+        damping = vanishing(self.net, cast_inexact(self.net.edge_field(self.damping), scene.dtype))
         return cast_inexact(eqx.tree_at(lambda f: f.damping, self, damping), scene.dtype)
 
     def force(self, state: State) -> Vector:
@@ -115,8 +115,8 @@ class Dashpots(Force):
             return Vector.zeros_like(state.position)
 
         damping = self.net.edge_field(self.damping)
-        if not self.net.has_margins and not isinstance(damping, ZeroOutside):
-            damping = self.net.vanishing(damping)
+        if not self.net.has_margins:
+            damping = vanishing(self.net, damping)
         if isinstance(damping, ZeroOutside):
             pull, fields = heeding(self.net, state, _pull, damping)
             return self.net.net_pull(pull, (state.position, state.velocity), *fields)

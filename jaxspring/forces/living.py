@@ -17,7 +17,7 @@ from jaxtyping import Array
 
 from ..state import State
 from ..topology.base import Topology
-from ..topology.edge_field import EdgeField, field_of
+from ..topology.edge_field import EdgeField, ZeroOutside, field_of
 from ..vector import Vector
 
 OfSprings = Callable[..., Any]
@@ -37,6 +37,18 @@ def heeding(net: Topology, state: State, function: OfSprings, *fields: Any) -> t
 def existing(net: Topology, function: OfSprings, *fields: Any) -> tuple[OfSprings, tuple[Any, ...]]:
     """The same for a function that does not vanish of itself where there is no spring: for `net_pull` of a net without margins."""
     return _OfLiving(function), (*fields, net.exists)
+
+
+def vanishing(net: Topology, constant: Array | EdgeField) -> Array | EdgeField:
+    """A constant as `net_pull` reads it, zero where there is no spring, so that pulls vanish there of themselves and need no mask.
+
+    One number for a whole lattice stays, and needs one.
+    """
+    if isinstance(constant, ZeroOutside):
+        return constant
+    if not isinstance(constant, EdgeField):
+        return constant if net.has_margins else net.vanishing(net.everywhere(constant))
+    return net.vanishing(constant)
 
 
 def map_living(net: Topology, state: State, function: OfSprings, *fields: Any) -> EdgeField:
@@ -69,4 +81,4 @@ def counted(value: Array, constant: Array, alive: Array) -> Array:
     return jnp.where(alive, value, finite)
 
 
-__all__ = ["counted", "existing", "heeding", "living", "map_living"]
+__all__ = ["counted", "existing", "heeding", "living", "map_living", "vanishing"]

@@ -33,7 +33,7 @@ from .in_box import along_axes, check_rest_length, long_springs, turned_springs
 from .laws import Hooke, Law, PowerLaw, TensionOnly, has_no_direction, length_of, spring_block, spring_energy, spring_pull
 from .lengths import beyond_range
 from .linearisation import Linearisation
-from .living import counted, existing, heeding, living, map_living
+from .living import counted, existing, heeding, living, map_living, vanishing
 
 
 class StiffnessRule(eqx.Module):
@@ -136,9 +136,9 @@ class Springs(Force):
         rule = self.stiffness
         stiffness = rule.bind(self.net, scene.dtype) if isinstance(rule, StiffnessRule) else self.net.edge_field(rule, "stiffness")
         if not isinstance(stiffness, StiffnessRule):
-            # Pulls then vanish of themselves where there is no spring, and no step need mask them.
-            stiffness = self.net.vanishing(cast_inexact(stiffness, scene.dtype))
-        rest_length = self.net.at_ends(cast_inexact(self.net.edge_field(self.rest_length, "rest_length"), scene.dtype))
+            stiffness = vanishing(self.net, cast_inexact(stiffness, scene.dtype))
+        rest_length = cast_inexact(self.net.edge_field(self.rest_length, "rest_length"), scene.dtype)
+        rest_length = self.net.at_ends(rest_length) if isinstance(rest_length, EdgeField) else rest_length
         return cast_inexact(eqx.tree_at(lambda s: (s.stiffness, s.rest_length), self, (stiffness, rest_length)), scene.dtype)
 
     def force(self, state: State) -> Vector:
@@ -146,8 +146,8 @@ class Springs(Force):
         if self.net.n_springs == 0:
             return Vector.zeros_like(state.position)
         k, l = self._constants(state)
-        if not self.net.has_margins and self.law.is_finite_at_zero and not isinstance(k, ZeroOutside):
-            k = self.net.vanishing(k)
+        if not self.net.has_margins and self.law.is_finite_at_zero:
+            k = vanishing(self.net, k)
         vanishes = isinstance(k, ZeroOutside) and self.law.is_finite_at_zero
         if self.net.has_margins and not vanishes:
             return self._embed(self.net.accumulate(self._each(state, _Pull(self.law))), state)

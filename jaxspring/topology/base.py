@@ -117,13 +117,17 @@ class Topology(eqx.Module):
             fields: what else a pull takes: numbers, and edge fields whose values do not change their sign with a spring's direction.
         """
 
-    def at_ends(self, field: Array | EdgeField) -> Array | EdgeField:
+    def at_ends(self, field: EdgeField) -> EdgeField:
         """The field as `net_pull` reads it, made once for many steps."""
         return field
 
-    def vanishing(self, field: Array | EdgeField) -> Array | EdgeField:
-        """The same, zero at places that are kept for springs that do not exist. Where it is one number for all springs it may stay."""
-        return ZeroOutside(self.inside(field, 0).families, field.identity) if isinstance(field, EdgeField) else field
+    def vanishing(self, field: EdgeField) -> EdgeField:
+        """The same, zero at places that are kept for springs that do not exist."""
+        return ZeroOutside(self.inside(field, 0).families, field.identity)
+
+    def everywhere(self, number: Array) -> EdgeField:
+        """One number for every spring."""
+        return self.own(jnp.broadcast_to(number, shape) for shape in self.family_shapes)
 
     @property
     def exists(self) -> Any:

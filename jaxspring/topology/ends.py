@@ -17,8 +17,9 @@ Source: the springs' symmetry (slide "Force Computation", f_ij = -f_ji); layout 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -40,7 +41,8 @@ _SURE: Any = {"mode": "promise_in_bounds", "wrap_negative_indices": False}
 Spread = tuple[Any, ...]  # for each class an array (width, count), or a `Vector` of such
 
 
-class Class(NamedTuple):
+@dataclass(frozen=True)
+class Class:
     """Nodes with about as many springs: entries `begin` to `begin + width * count`, row by row.
 
     Attributes:
@@ -124,10 +126,20 @@ class Ends(eqx.Module):
         places = np.zeros(pairs.size, np.int32)
         places[entries[real.astype(bool)]] = np.flatnonzero(real)
         neighbours, (at_tails, at_heads) = np.concatenate([heads, tails])[entries], np.split(places, 2)
-        integers = [a.astype(np.int32) for a in (neighbours, owners, entries)]
-        is_real = None if real.all() else real
-        found = Ends(*integers, is_real, tails, heads, at_tails, at_heads, rounds, tuple(classes), n_nodes)
-        return jax.tree.map(jnp.asarray, found), order
+        found = Ends(
+            neighbours=jnp.asarray(neighbours, jnp.int32),
+            owners=jnp.asarray(owners, jnp.int32),
+            entries=jnp.asarray(entries, jnp.int32),
+            real=None if real.all() else jnp.asarray(real),
+            tails=jnp.asarray(tails),
+            heads=jnp.asarray(heads),
+            at_tails=jnp.asarray(at_tails),
+            at_heads=jnp.asarray(at_heads),
+            rounds=tuple(map(jnp.asarray, rounds)),
+            classes=tuple(classes),
+            count=n_nodes,
+        )
+        return found, order
 
     # Linear maps, each with its transpose. Transposes leave out the entries of no spring: pulls and all their derivatives but those by the
     # fields that vanish are zero there.

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ..vector import Vector
 from .base import Topology
 from .edge_field import AtEnds, EdgeField, ZeroOutside
 from .ends import Ends, Spread
@@ -76,16 +77,18 @@ class ListedSprings(Topology):
         if self.n_springs == 0:
             return Vector.zeros_like(moving[0])
         whole = pull if self.box is None else _Wrapped(pull, self.box)
-        pulls = self.ends.net_pull(whole, [v.map(self._taken) for v in moving], [self._spread_out(field) for field in fields])
+        pulls = self.ends.net_pull(
+            whole, [v.map(self._taken) for v in moving], [self._at_ends(f) if isinstance(f, EdgeField) else f for f in fields]
+        )
         return pulls.map(self._put)
 
-    def at_ends(self, field: Array | EdgeField) -> Array | EdgeField:
-        """An edge field that each step reads, spread over both ends of each spring once; one number stays."""
-        return AtEnds(field.families, field.identity, self._spread_out(field)) if isinstance(field, EdgeField) else field
+    def at_ends(self, field: EdgeField) -> EdgeField:
+        """An edge field that each step reads, spread over both ends of each spring once."""
+        return AtEnds(field.families, field.identity, self._at_ends(field))
 
-    def vanishing(self, field: Array | EdgeField) -> ZeroOutside:
-        """The same, zero at places of no spring."""
-        full = self._spread(field) if isinstance(field, EdgeField) else self.own((jnp.broadcast_to(field, (self.n_springs,)),))
+    def vanishing(self, field: EdgeField) -> EdgeField:
+        """The same, zero at entries of no spring."""
+        full = self._spread(field)
         return ZeroOutside(full.families, full.identity, self.ends.spread(full.families[0], vanishing=True))
 
     @property
@@ -94,10 +97,8 @@ class ListedSprings(Topology):
         real = self.ends.real
         return AtEnds((), self.identity, tuple(jnp.ones((), bool) if real is None else one.rows(real) for one in self.ends.classes))
 
-    def _spread_out(self, field: Any) -> Spread | Array:
-        if isinstance(field, AtEnds):
-            return field.ends
-        return self.ends.spread(self._spread(field).families[0]) if isinstance(field, EdgeField) else field
+    def _at_ends(self, field: EdgeField) -> Spread:
+        return field.ends if isinstance(field, AtEnds) else self.ends.spread(self._spread(field).families[0])
 
     def incident_sum(self, values: EdgeField) -> Array:
         """Sum over the springs at each node."""

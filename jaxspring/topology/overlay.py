@@ -104,9 +104,9 @@ class Overlay(ListedSprings):
         """Node array -> (T,)."""
         return linear_call(partial(_take, self.node_shape), partial(_put, self.node_shape), (self.where, self.back), a)
 
-    def _put(self, v: Array) -> Array:
+    def _put(self, a: Array) -> Array:
         """(T,) -> node array, zero elsewhere."""
-        return linear_call(partial(_put, self.node_shape), partial(_take, self.node_shape), (self.where, self.back), v)
+        return linear_call(partial(_put, self.node_shape), partial(_take, self.node_shape), (self.where, self.back), a)
 
 
 def _take(shape: tuple[int, ...], tables: Any, a: Array) -> Array:

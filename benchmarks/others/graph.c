@@ -1,87 +1,117 @@
 /* Graphs of springs by hand: nodes in slices of 16, sorted by degree; every spring computed at both of its ends, so that nothing is
-   scattered. Positions are read from one buffer and written to the next, so that threads meet once a step. */
+   scattered. Four numbers a node, x y z 0, so that a neighbour is one load; sixteen of them are turned in registers. Positions are read
+   from one buffer and written to the next, so that threads meet once a step. */
 
-#include <math.h>
-#include <string.h>
-#ifdef _OPENMP
-#include <omp.h>
-#else
-#define omp_get_thread_num() 0
-#endif
+#include "vectors.h"
 
-#define LANES 16
 #define TINY 1e-30f /* a place that pads names its own node, with k = 0 */
 
-/* x: (history, 3, n); v: (3, n); heads, k, l: entries, slice by slice, 16 at a time. */
-void graph(int n, int n_slices, const int *starts, const int *heads, const float *k, const float *l, float *x, float *v, float dt,
-           int n_steps, int history, int threads) {
+typedef struct {
+    v16 x, y, z;
+} V3;
+
+#ifdef __AVX512F__
+static inline V3 fetch(const float *from, const int *nodes) {
+    __m512 r[4];
+    for (int q = 0; q < 4; q++) {
+        r[q] = _mm512_castps128_ps512(_mm_loadu_ps(from + 4L * nodes[q]));
+        r[q] = _mm512_insertf32x4(r[q], _mm_loadu_ps(from + 4L * nodes[q + 4]), 1);
+        r[q] = _mm512_insertf32x4(r[q], _mm_loadu_ps(from + 4L * nodes[q + 8]), 2);
+        r[q] = _mm512_insertf32x4(r[q], _mm_loadu_ps(from + 4L * nodes[q + 12]), 3);
+    }
+    const __m512d a = _mm512_castps_pd(_mm512_unpacklo_ps(r[0], r[1])), b = _mm512_castps_pd(_mm512_unpacklo_ps(r[2], r[3]));
+    const __m512d c = _mm512_castps_pd(_mm512_unpackhi_ps(r[0], r[1])), d = _mm512_castps_pd(_mm512_unpackhi_ps(r[2], r[3]));
+    return (V3){(v16)_mm512_unpacklo_pd(a, b), (v16)_mm512_unpackhi_pd(a, b), (v16)_mm512_unpacklo_pd(c, d)};
+}
+#else
+static inline V3 fetch(const float *from, const int *nodes) {
+    V3 out;
+    for (int a = 0; a < LANES; a++) {
+        const float *node = from + 4L * nodes[a];
+        out.x[a] = node[0], out.y[a] = node[1], out.z[a] = node[2];
+    }
+    return out;
+}
+#endif
+
+/* Of sixteen nodes in a row. */
+static inline V3 own(const float *from) {
+    static const int in_order[LANES] = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
+    return fetch(from, in_order);
+}
+
+static inline void put(float *to, V3 a) {
+    for (int i = 0; i < LANES; i++) to[4 * i] = a.x[i], to[4 * i + 1] = a.y[i], to[4 * i + 2] = a.z[i];
+}
+
+static inline V3 minus(V3 a, V3 b) { return (V3){a.x - b.x, a.y - b.y, a.z - b.z}; }
+static inline V3 plus(V3 a, v16 w, V3 b) { return (V3){a.x + w * b.x, a.y + w * b.y, a.z + w * b.z}; }
+static inline v16 dot(V3 a, V3 b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+
+static inline v16 at_least(v16 a, float low) {
+    for (int i = 0; i < LANES; i++) a[i] = a[i] > low ? a[i] : low;
+    return a;
+}
+
+/* x: (history, n, 4); v: (n, 4); heads, k, l: entries, slice by slice, 16 at a time. Step t writes x[(t + 1) % history]. */
+void graph(int n, const int *starts, const int *heads, const float *k, const float *l, float *x, float *v, float dt, int n_steps,
+           int history, int threads) {
+    const long n_slices = n / LANES;
+    const v16 step = dt + (v16){0};
 #pragma omp parallel num_threads(threads) if (threads > 1)
     {
-        const int me = omp_get_thread_num();
-        const int begin = (long)n_slices * me / threads, end = (long)n_slices * (me + 1) / threads;
+        const int me = omp_get_thread_num(), begin = n_slices * me / threads, end = n_slices * (me + 1) / threads;
         for (int t = 0; t < n_steps; t++) {
-            const float *restrict x0 = x + (long)(t % history) * 3 * n, *restrict x1 = x0 + n, *restrict x2 = x1 + n;
-            float *restrict y0 = x + (long)((t + 1) % history) * 3 * n, *restrict y1 = y0 + n, *restrict y2 = y1 + n;
-            float *restrict v0 = v, *restrict v1 = v + n, *restrict v2 = v + 2 * n;
+            const float *from = x + (t % history) * 4L * n;
+            float *to = x + ((t + 1) % history) * 4L * n;
             for (int s = begin; s < end; s++) {
-                float f0[LANES] = {0}, f1[LANES] = {0}, f2[LANES] = {0};
-                const int at = s * LANES;
+                const long mine = 4L * LANES * s;
+                const V3 here = own(from + mine);
+                V3 force = {{0}, {0}, {0}};
                 for (int e = starts[s]; e < starts[s + 1]; e += LANES) {
-#pragma GCC ivdep
-                    for (int a = 0; a < LANES; a++) {
-                        const int j = heads[e + a];
-                        const float d0 = x0[j] - x0[at + a], d1 = x1[j] - x1[at + a], d2 = x2[j] - x2[at + a];
-                        const float w = k[e + a] * (1.0f - l[e + a] / sqrtf(fmaxf(d0 * d0 + d1 * d1 + d2 * d2, TINY)));
-                        f0[a] += w * d0, f1[a] += w * d1, f2[a] += w * d2;
-                    }
+                    const V3 d = minus(fetch(from, heads + e), here);
+                    force = plus(force, load(k + e) * (1.0f - load(l + e) * inverse_root(at_least(dot(d, d), TINY))), d);
                 }
-                for (int a = at; a < at + LANES; a++) {
-                    v0[a] += dt * f0[a - at], v1[a] += dt * f1[a - at], v2[a] += dt * f2[a - at];
-                    y0[a] = x0[a] + dt * v0[a], y1[a] = x1[a] + dt * v1[a], y2[a] = x2[a] + dt * v2[a];
-                }
+                const V3 speed = plus(own(v + mine), step, force);
+                put(v + mine, speed);
+                put(to + mine, plus(here, step, speed));
             }
 #pragma omp barrier
         }
     }
 }
 
-/* After `graph` with a whole history. g: (3, n) and b: (2, 3, n) zeros; of_k, of_l: entries, zeros, filled for the loss sum x^2. */
-void graph_gradient(int n, int n_slices, const int *starts, const int *heads, const float *k, const float *l, const float *x, float *g,
-                    float *b, float *of_k, float *of_l, float dt, int n_steps, int threads) {
-    for (long i = 0; i < 3L * n; i++) {
-        g[i] = 2 * x[(long)n_steps * 3 * n + i];
+/* After `graph` with a whole history: the gradient of the sum of squared last positions. g: (n, 4) and b: (2, n, 4) zeros; of_k, of_l:
+   entries, zeros, filled; both ends of a spring find the same. */
+void graph_gradient(int n, const int *starts, const int *heads, const float *k, const float *l, const float *x, float *g, float *b,
+                    float *of_k, float *of_l, float dt, int n_steps, int threads) {
+    const long n_slices = n / LANES;
+    const v16 step = dt + (v16){0};
+    for (long i = 0; i < 4L * n; i++) {
+        g[i] = 2 * x[n_steps * 4L * n + i];
         b[i] = dt * g[i];
     }
 #pragma omp parallel num_threads(threads) if (threads > 1)
     {
-        const int me = omp_get_thread_num();
-        const int begin = (long)n_slices * me / threads, end = (long)n_slices * (me + 1) / threads;
+        const int me = omp_get_thread_num(), begin = n_slices * me / threads, end = n_slices * (me + 1) / threads;
         for (int t = n_steps - 1; t >= 0; t--) {
-            const float *restrict x0 = x + (long)t * 3 * n, *restrict x1 = x0 + n, *restrict x2 = x1 + n;
-            const float *restrict b0 = b + ((n_steps - 1 - t) % 2) * 3L * n, *restrict b1 = b0 + n, *restrict b2 = b1 + n;
-            float *restrict c0 = b + ((n_steps - t) % 2) * 3L * n, *restrict c1 = c0 + n, *restrict c2 = c1 + n;
-            float *restrict g0 = g, *restrict g1 = g + n, *restrict g2 = g + 2 * n;
+            const float *at = x + t * 4L * n, *from = b + ((n_steps - 1 - t) % 2) * 4L * n;
+            float *to = b + ((n_steps - t) % 2) * 4L * n;
             for (int s = begin; s < end; s++) {
-                float f0[LANES] = {0}, f1[LANES] = {0}, f2[LANES] = {0};
-                const int at = s * LANES;
+                const long mine = 4L * LANES * s;
+                const V3 here = own(at + mine), b_here = own(from + mine);
+                V3 sum = {{0}, {0}, {0}};
                 for (int e = starts[s]; e < starts[s + 1]; e += LANES) {
-#pragma GCC ivdep
-                    for (int a = 0; a < LANES; a++) {
-                        const int j = heads[e + a];
-                        const float d0 = x0[j] - x0[at + a], d1 = x1[j] - x1[at + a], d2 = x2[j] - x2[at + a];
-                        const float a0 = dt * (b0[at + a] - b0[j]), a1 = dt * (b1[at + a] - b1[j]), a2 = dt * (b2[at + a] - b2[j]);
-                        const float r = 1.0f / sqrtf(fmaxf(d0 * d0 + d1 * d1 + d2 * d2, TINY)), along = d0 * a0 + d1 * a1 + d2 * a2;
-                        const float stretch = 1.0f - l[e + a] * r, w = k[e + a] * stretch;
-                        const float turn = k[e + a] * l[e + a] * r * r * r * along;
-                        f0[a] += w * a0 + turn * d0, f1[a] += w * a1 + turn * d1, f2[a] += w * a2 + turn * d2;
-                        of_k[e + a] += stretch * along;
-                        of_l[e + a] -= k[e + a] * r * along;
-                    }
+                    const V3 d = minus(fetch(at, heads + e), here), a = minus(b_here, fetch(from, heads + e));
+                    const v16 ke = load(k + e), le = load(l + e), r = inverse_root(at_least(dot(d, d), TINY)), along = step * dot(d, a);
+                    const v16 stretch = 1.0f - le * r;
+                    sum = plus(plus(sum, step * ke * stretch, a), ke * le * r * r * r * along, d);
+                    store(of_k + e, load(of_k + e) + stretch * along);
+                    store(of_l + e, load(of_l + e) - ke * r * along);
                 }
-                for (int a = at; a < at + LANES; a++) {
-                    g0[a] -= f0[a - at], g1[a] -= f1[a - at], g2[a] -= f2[a - at];
-                    c0[a] = b0[a] + dt * g0[a], c1[a] = b1[a] + dt * g1[a], c2[a] = b2[a] + dt * g2[a];
-                }
+                const V3 of_x = minus(own(g + mine), sum);
+                put(g + mine, of_x);
+                put(to + mine, plus(b_here, step, of_x));
             }
 #pragma omp barrier
         }

@@ -51,6 +51,9 @@ class Scene:
     def __getitem__(self, name: str) -> np.ndarray:
         return np.asarray(self._values[name])
 
+    def __contains__(self, name: str) -> bool:
+        return name in self._values
+
     def number(self, name: str) -> Any:
         """A float or an int."""
         return self[name].item()

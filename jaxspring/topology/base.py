@@ -114,7 +114,7 @@ class Topology(eqx.Module):
             pull: of the springs of a family, or of some of a list: odd in the differences, and zero for springs that do not exist. Where
                 there are derivatives by its own constants, a module that holds them.
             x: what differences are taken of, the nearest images of the first; or several `Vector`s.
-            fields: what else a pull takes: numbers, and edge fields whose values do not change their sign with a spring's direction.
+            *fields: what else a pull takes: numbers, and edge fields whose values do not change their sign with a spring's direction.
         """
 
     def at_ends(self, field: EdgeField) -> EdgeField:
@@ -130,9 +130,9 @@ class Topology(eqx.Module):
         return self.own(jnp.broadcast_to(number, shape) for shape in self.family_shapes)
 
     @property
-    def exists(self) -> Any:
-        """Where `net_pull` finds a spring, as one of its fields; of a net without margins."""
-        raise NotImplementedError
+    def exists(self) -> EdgeField:
+        """Where there is a spring, as a field of `net_pull`."""
+        return self.inside(self.everywhere(jnp.ones((), bool)), False)
 
     @property
     def has_margins(self) -> bool:

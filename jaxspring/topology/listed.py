@@ -92,8 +92,8 @@ class ListedSprings(Topology):
         return ZeroOutside(full.families, full.identity, self.ends.spread(full.families[0], vanishing=True))
 
     @property
-    def exists(self) -> AtEnds:
-        """Which entries are of a spring, as a field of `net_pull`."""
+    def exists(self) -> EdgeField:
+        """Where there is a spring, as a field of `net_pull`."""
         real = self.ends.real
         return AtEnds((), self.identity, tuple(jnp.ones((), bool) if real is None else one.rows(real) for one in self.ends.classes))
 

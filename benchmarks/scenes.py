@@ -32,10 +32,14 @@ def mesh(n_nodes: int, seed: int = 0) -> tuple[js.System, js.State]:
     points = rng.random((n_nodes, 2)) * np.sqrt(n_nodes)
     corners = Delaunay(points).simplices
     edges = np.unique(np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1), axis=0)
-    net = js.Graph.from_edges(edges, n_nodes)
-    flat = np.concatenate([points, np.zeros((n_nodes, 1))], axis=1)
-    rest = np.linalg.norm(flat[edges[:, 1]] - flat[edges[:, 0]], axis=1)
-    return _hung(net, flat, rest, rng, noise=0.01)
+    return graph(np.concatenate([points, np.zeros((n_nodes, 1))], axis=1), edges, rng)
+
+
+def graph(points: np.ndarray, edges: np.ndarray, rng: np.random.Generator | None = None) -> tuple[js.System, js.State]:
+    """Springs along (E, 2) edges between (N, 3) points, at rest there, pushed about a little; float32."""
+    net = js.Graph.from_edges(edges, len(points))
+    rest = np.linalg.norm(points[edges[:, 1]] - points[edges[:, 0]], axis=1)
+    return _hung(net, points, rest, np.random.default_rng(0) if rng is None else rng, noise=0.01)
 
 
 def _hung(net: Any, flat: np.ndarray, rest: np.ndarray, rng: np.random.Generator, noise: float = 0.05) -> tuple[js.System, js.State]:

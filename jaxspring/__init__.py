@@ -37,6 +37,7 @@ if TYPE_CHECKING:  # written by `python -m tests.face`
     from .resume import Resume as Resume
     from .rollouts import Result as Result
     from .rollouts import rollout as rollout
+    from .batching import batch as batch
     from .ode import OdeInfo as OdeInfo
     from .ode import OdeResult as OdeResult
     from .ode import diffeqsolve as diffeqsolve

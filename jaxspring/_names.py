@@ -19,6 +19,7 @@ PUBLIC: dict[str, dict[str, tuple[str, ...]]] = {
         "edit": ("replace",),
         "resume": ("Resume",),
         "rollouts": ("Result", "rollout"),
+        "batching": ("batch",),
         "ode": ("OdeInfo", "OdeResult", "diffeqsolve"),
         "blocks": ("Checkpointed", "StoreAll", "StoreStates"),
         "watch": ("Solves",),

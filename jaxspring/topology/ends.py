@@ -31,7 +31,7 @@ from jaxtyping import Array, Bool, Int
 from ..numerics import linear_call
 from ..vector import Vector
 
-WIDEST = 32  # springs that a node reads in one column
+WIDEST = 64  # springs that a node reads in one column
 TABLE = 200  # entries that are read in the time that one more class costs: with fewer classes small graphs are faster, and compile sooner
 SHARE = 100  # a class is worth its compile time where it saves this part of all entries
 # Every index is in range by construction; without the test for negative ones programs compile in half the time.
@@ -66,7 +66,7 @@ class Class:
     def own(self, x: Array, owners: Array) -> Array:
         """Of a node array (N,) the value at each column's node, for every row; nodes of a class are one after the other."""
         if self.is_hubs:
-            return _read(x, lax.slice(owners, (self.begin,), (self.begin + self.count,)))[None]
+            return _read(x, owners)[None]
         return lax.slice(x, (self.first,), (self.first + self.count,))[None]
 
 
@@ -75,7 +75,7 @@ class Ends(eqx.Module):
 
     Attributes:
         neighbours: (H,) the node at the other end.
-        owners: (H,) the node at this end.
+        owners: of the class of hubs, the node of each column.
         entries: (H,) which spring, counted as E tails and then E heads.
         real: (H,) False where a node has fewer springs than its class: the entry repeats its first one. None where all have as many.
         tails: (E,) tail node of each spring.
@@ -89,7 +89,7 @@ class Ends(eqx.Module):
     """
 
     neighbours: Int[Array, " H"]
-    owners: Int[Array, " H"]
+    owners: Int[Array, " columns"]
     entries: Int[Array, " H"]
     real: Bool[Array, " H"] | None
     tails: Int[Array, " E"]
@@ -109,7 +109,7 @@ class Ends(eqx.Module):
         width = _widths(degree)
         order = np.lexsort((np.arange(n_nodes), np.where(width == 0, WIDEST + 2, width)))
         tails, heads = np.argsort(order)[pairs.T].astype(np.int32)
-        classes, tables, rounds, first, begin = [], [], (), 0, 0
+        classes, tables, owners, rounds, first, begin = [], [], np.zeros(0, int), (), 0, 0
         for w in np.unique(width[width > 0]):
             nodes = order[width[order] == w]
             n_parts = -(-degree[nodes] // WIDEST)
@@ -118,11 +118,11 @@ class Ends(eqx.Module):
             slot, real_to = np.arange(rows)[:, None], np.minimum(degree[nodes][of] - done, WIDEST)
             real = slot < real_to
             entries = by_node[start[nodes][of] + done + np.where(real, slot, 0)]
-            tables.append((entries.ravel(), real.ravel(), np.broadcast_to(first + of, entries.shape).ravel()))
+            tables.append((entries.ravel(), real.ravel()))
             classes.append(Class(rows, len(of), first, begin, bool(w > WIDEST)))
-            rounds = _rounds(n_parts) if w > WIDEST else rounds
+            owners, rounds = (first + of, _rounds(n_parts)) if w > WIDEST else (owners, rounds)
             first, begin = first + len(nodes), begin + entries.size
-        entries, real, owners = (np.concatenate(column) for column in zip(*tables, strict=True)) if tables else (np.zeros(0, int),) * 3
+        entries, real = (np.concatenate(column) for column in zip(*tables, strict=True)) if tables else (np.zeros(0, int),) * 2
         places = np.zeros(pairs.size, np.int32)
         places[entries[real.astype(bool)]] = np.flatnonzero(real)
         neighbours, (at_tails, at_heads) = np.concatenate([heads, tails])[entries], np.split(places, 2)

@@ -45,6 +45,7 @@ LAYERS = {
     "resume": 6,
     "rollouts": 6,
     "events": 6,
+    "batching": 6,
     "ode": 6,
     "inverse": 7,
     "study": 7,

@@ -33,7 +33,7 @@ EDGES = {
     "radius": (radius(90, 2, 0.2), 91),  # and a node alone
     "power law": (power_law(300), 300),
     "star": (np.array([(0, i) for i in range(1, 1200)]), 1200),
-    "two hubs": (np.array([(i % 2, i) for i in range(2, 90)] + [(0, 1)]), 95),
+    "two hubs": (np.array([(i % 2, i) for i in range(2, 190)] + [(0, 1)]), 195),
     "chain": (np.array([(i, i + 1) for i in range(19)]), 20),
     "tree": (np.array([((i - 1) // 3, i) for i in range(1, 60)]), 60),
     "double": (np.array([(0, 1), (0, 1), (1, 0), (1, 2)]), 3),

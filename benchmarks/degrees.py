@@ -12,6 +12,7 @@ the entries that hold no spring.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -66,7 +67,8 @@ def rows(n: int, n_steps: int, rounds: int) -> list[dict]:
     found = []
     for name, (points, edges) in nets(n).items():
         system, state = scenes.graph(points, edges)
-        entries = system.net.ends.entries.size
+        net: Any = system.net
+        entries, classes = net.ends.entries.size, len(net.ends.classes)
         timed = measure(
             [
                 Case("bare", *scenes.bare_mesh(system, state, DT, n_steps)),
@@ -82,7 +84,7 @@ def rows(n: int, n_steps: int, rounds: int) -> list[dict]:
                 "nodes": n,
                 "springs": len(edges),
                 "most": int(np.bincount(edges.ravel()).max()),
-                "classes": len(system.net.ends.classes),
+                "classes": classes,
                 "padded": 1 - 2 * len(edges) / entries,
                 "M springs": len(edges) * n_steps / run / 1e6,
                 "over_bare": run / timed["bare"].run_s,

@@ -82,7 +82,9 @@ def batch(function: Callable[..., Any], in_axes: Any = 0, *, chunk: int | None =
             return _in_chunks(of_one, shared, mapped, n_here, chunk)
 
         scenes = PartitionSpec(mesh.axis_names)
-        return jax.shard_map(of_device, mesh=mesh, in_specs=(PartitionSpec(), scenes), out_specs=scenes, check_vma=False)(shared, mapped)
+        # Axes that are not explicit, so that arguments may come from anywhere.
+        devices = Mesh(mesh.devices, mesh.axis_names)
+        return jax.shard_map(of_device, mesh=devices, in_specs=(PartitionSpec(), scenes), out_specs=scenes, check_vma=False)(shared, mapped)
 
     return of_batch
 

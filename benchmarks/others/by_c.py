@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from .layouts import LANES, NOWHERE, Forms, Program, Scene, of_springs, padded, slices, to_springs
+from .layouts import LANES, NOWHERE, Forms, Program, Scene, of_axes, of_springs, padded, slices, to_springs
 
 THREADS = int(os.environ.get("OMP_NUM_THREADS", "1"))
 FLAGS = ("-O3", "-march=native", "-ffast-math", "-shared", "-fPIC")
@@ -141,17 +141,6 @@ def heat(scene: Scene, c: Any, threads: int) -> Program:
         c.heat(*shape, at(wide[2]), at(wide[1]), at(wide[0]), at(t), dt, n_steps, threads)
 
     return Program(run, lambda: t[last[0]][inside].ravel())
-
-
-def of_axes(scene: Scene) -> np.ndarray:
-    """(3, nz, ny, nx) conductances at the lower node of each axis, zero at the last."""
-    shape = tuple(scene["shape"].tolist())
-    dense, begin = np.zeros((3, *shape), np.float32), 0
-    for axis in (2, 1, 0):
-        part = dense[axis][tuple(slice(0, n - (a == axis)) for a, n in enumerate(shape))]
-        part[...] = scene["g"][begin : begin + part.size].reshape(part.shape)
-        begin += part.size
-    return dense
 
 
 def _sliced(scene: Scene) -> tuple[Any, ...]:

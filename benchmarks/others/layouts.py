@@ -156,3 +156,14 @@ def slices(scene: Scene, window: int = 1024) -> Slices:
         heads[begins[s] : begins[s + 1]] = block.ravel()
         which[begins[s] : begins[s + 1]] = ids.ravel()
     return Slices(nodes, begins.astype(np.int32), heads, which)
+
+
+def of_axes(scene: Scene) -> np.ndarray:
+    """(3, nz, ny, nx) conductances at the lower node of each axis, zero at the last."""
+    shape = tuple(scene["shape"].tolist())
+    dense, begin = np.zeros((3, *shape), np.float32), 0
+    for axis in (2, 1, 0):
+        part = dense[axis][tuple(slice(0, n - (a == axis)) for a, n in enumerate(shape))]
+        part[...] = scene["g"][begin : begin + part.size].reshape(part.shape)
+        begin += part.size
+    return dense

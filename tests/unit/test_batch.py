@@ -123,6 +123,9 @@ DEVICES = """
     two = jax.jit(js.batch(scene, chunk=2, mesh=mesh))
     for a, b in zip(jax.tree.leaves(one(*inputs)), jax.tree.leaves(two(*inputs)), strict=True):
         np.testing.assert_array_equal(a, b)
+    made = jax.make_mesh((2,), ("scenes",))
+    np.testing.assert_array_equal(jax.jit(js.batch(scene, mesh=made))(*inputs).state.points, jax.jit(js.batch(scene))(*inputs).state.points)
+    np.testing.assert_array_equal(js.batch(scene, mesh=made)(*inputs).status.is_ok, [True] * 8)
     found = two(*inputs).state.points
     assert len(found.sharding.device_set) == 2
 
@@ -157,3 +160,32 @@ def test_two_devices_give_the_bits_of_one():
     program = textwrap.dedent(DEVICES.format(root=str(ROOT)))
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=environment, check=False, cwd=ROOT)
     assert done.stdout == "done\n", done.stderr[-3000:]
+
+
+CACHED = """
+    import sys
+    import jax
+    jax.config.update("jax_compilation_cache_dir", sys.argv[1])
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+    import numpy as np
+    import jaxspring as js
+    net = js.Graph.from_edges([(0, 1), (1, 2), (2, 3), (0, 2)], 4)
+    points = np.random.default_rng(0).normal(size=(4, 2))
+    def loss(k):
+        system = js.System(net, 1.0, js.Springs(net, k, 1.0, law=js.EnergyLaw(lambda r, k, l: 0.5 * k * (r - l) ** 2)))
+        return (js.rollout(system, js.State.from_points(net, points), js.BackwardEuler(), 0.01, 10).state.points ** 2).sum()
+    print(float(jax.jit(jax.grad(loss))(np.full(4, 3.0))[0]))
+"""
+
+
+def test_compiled_programs_are_found_again(tmp_path):
+    """With JAX's cache on the disk a second process compiles nothing: no program of the library differs from one process to the next."""
+    outputs, counts = [], []
+    for _ in range(2):
+        command = [sys.executable, "-c", textwrap.dedent(CACHED), str(tmp_path)]
+        done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT)
+        outputs.append(done.stdout)
+        counts.append(len(list(tmp_path.glob("*-cache"))))
+    assert counts[0] == counts[1] > 0
+    assert outputs[0] == outputs[1]

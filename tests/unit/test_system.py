@@ -136,7 +136,7 @@ def test_gradient_with_respect_to_a_system(scene):
     np.testing.assert_allclose(gradient.forces[0].rest_length, -3.0 * stretch, rtol=1e-12)
     np.testing.assert_allclose(net.flatten_nodes(gradient.mass), 0.5 * (np.asarray(state.velocities) ** 2).sum(axis=1), rtol=1e-12)
     assert gradient.free is None
-    assert gradient.net.tails is None
+    assert gradient.net.ends.tails is None
 
 
 def test_one_parameter_may_serve_two_forces(scene):

@@ -4,8 +4,8 @@
 
 1,024 cloths of 16 x 16 (structural, shear, bend; every scene with its own start and stiffness), symplectic Euler, 100 steps, float32, with
 statuses. Read: `M` is million node-steps a second, `over_vmap` the time over that of `jax.vmap` in the same interleaved rounds. Then
-weak scaling: 512 scenes on one host device and one core, 1,024 on two, each in a process of its own; `efficiency` is the time on one over
-that on two.
+weak scaling, each in a process of its own: 512 scenes on one host device and one core, 1,024 on two; one cloth of 1,024 rows of 1,024
+nodes on one, of 2,048 rows on two. `efficiency` is the time on one over that on two.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from . import scenes
 from .measure import RESULTS, Case, Panel, draw, measure, show, write
 from .measure import arguments as parsed
 
-N, STEPS = 16, 100
+N, STEPS, COLUMNS = 16, 100, 1024
 ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -66,44 +66,64 @@ def chunks(n_scenes: int, rounds: int) -> list[dict]:
     ]
 
 
-def on_devices(n_devices: int, n_scenes: int, rounds: int) -> dict:
+def on_devices(what: str, n_devices: int, size: int, rounds: int) -> dict:
     """Weak scaling, in a process with so many host devices, and as many cores."""
     flags = f"--xla_force_host_platform_device_count={n_devices} --xla_cpu_multi_thread_eigen=false"
     cores = ",".join(str(core) for core in sorted(os.sched_getaffinity(0))[:n_devices])
-    command = ["taskset", "-c", cores, sys.executable, "-m", "benchmarks.batches", "--devices", str(n_scenes), str(rounds)]
+    command = ["taskset", "-c", cores, sys.executable, "-m", "benchmarks.batches", what, str(size), str(rounds)]
     done = subprocess.run(command, cwd=ROOT, env={**os.environ, "XLA_FLAGS": flags}, capture_output=True, text=True, check=True)
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def serve(n_scenes: int, rounds: int) -> None:
+def serve(what: str, size: int, rounds: int) -> None:
     """What `on_devices` starts: a line of JSON."""
-    mesh = jax.make_mesh((jax.device_count(),), ("scenes",))
-    timed = measure([Case("batch", jax.jit(js.batch(scene, mesh=mesh)), inputs(n_scenes))], rounds)["batch"]
-    rate = n_scenes * N * N * STEPS / timed.run_s / 1e6
-    print(json.dumps({"devices": jax.device_count(), "scenes": n_scenes, "seconds": timed.run_s, "M": rate}))
+    mesh = jax.make_mesh((jax.device_count(),), ("shared",))
+    if what == "--scenes":
+        case, nodes = Case(what, jax.jit(js.batch(scene, mesh=mesh)), inputs(size)), size * N * N
+    else:
+        case, nodes = Case(what, *large(size, mesh)), size * COLUMNS
+    seconds = measure([case], rounds)[what].run_s
+    print(json.dumps({"devices": jax.device_count(), "nodes": nodes, "seconds": seconds, "M": nodes * STEPS / seconds / 1e6}))
+
+
+def large(rows: int, mesh: Any) -> tuple[Any, tuple[Any, ...]]:
+    """One cloth of so many rows, shared out."""
+    net, rng = js.lattice((rows, COLUMNS), springs=scenes.FAMILIES), np.random.default_rng(0)
+    points = np.pad(net.grid(), ((0, 0), (0, 1))) + 0.05 * rng.standard_normal((rows * COLUMNS, 3))
+    state = js.domain(js.State.from_points(net, points.astype(np.float32)), mesh)
+    k = jnp.asarray(1 + 0.1 * rng.random(net.n_springs), jnp.float32)
+
+    def run(k: Any, state: js.State) -> Any:
+        return js.rollout(js.System(net, 1.0, js.Springs(net, k, jnp.float32(1))), state, js.SymplecticEuler(), 0.05, STEPS)
+
+    return jax.jit(run), (k, state)
 
 
 def main() -> None:
     """Measure, print, write the table and the picture."""
-    if sys.argv[1:2] == ["--devices"]:
-        serve(int(sys.argv[2]), int(sys.argv[3]))
+    if sys.argv[1:2] in (["--scenes"], ["--rows"]):
+        serve(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]))
         return
     quick = parsed(__doc__).quick
     n_scenes, rounds = (128, 3) if quick else (1024, 7)
     table = chunks(n_scenes, rounds)
     show(f"{n_scenes} cloths of {N} x {N}", table)
-    scaling = [on_devices(n, n * n_scenes // 2, rounds) for n in (1, 2)]
-    for row in scaling:
-        row["efficiency"] = scaling[0]["seconds"] / row["seconds"]
+    scaling, rows = [], 128 if quick else 1024
+    for what, size in (("--scenes", n_scenes // 2), ("--rows", rows)):
+        one, two = (on_devices(what, n, n * size, rounds) for n in (1, 2))
+        scaling += [{"what": what[2:], **row, "efficiency": one["seconds"] / row["seconds"]} for row in (one, two)]
     show("weak scaling over host devices", scaling)
-    settings = {"dtype": "float32", "rounds": rounds, "scenes": n_scenes, "steps": STEPS}
+    settings = {"dtype": "float32", "rounds": rounds, "scenes": n_scenes, "steps": STEPS, "rows": rows, "columns": COLUMNS}
     write("batches", settings, {"chunks": table, "scaling": scaling})
     sizes = [float(row["way"].split("=")[1]) for row in table[2:]]
     curves = {("js.batch", "o-"): (sizes, [row["M"] for row in table[2:]]), ("jax.vmap", "s"): ([float(n_scenes)], [table[0]["M"]])}
-    devices = {("weak scaling", "o-"): ([float(row["devices"]) for row in scaling], [float(row["M"]) for row in scaling])}
+    of = {what: [row for row in scaling if row["what"] == what] for what in ("scenes", "rows")}
+    names = {"scenes": "js.batch: 512 cloths per device", "rows": "js.domain: 1,024 rows per device"}
+    at = [1.0, 2.0]
+    devices = {(names[what], style): (at, [row["M"] for row in of[what]]) for what, style in (("scenes", "o-"), ("rows", "s-"))}
     speed = "million node-steps / s"
     panels = [Panel(f"{n_scenes} cloths of 16 x 16", speed, curves, xlabel="scenes in a chunk")]
-    draw([*panels, Panel("512 cloths per device", speed, devices, xlabel="devices")], RESULTS / "batches.png")
+    draw([*panels, Panel("weak scaling", speed, devices, xlabel="devices")], RESULTS / "batches.png")
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ PUBLIC: dict[str, dict[str, tuple[str, ...]]] = {
         "resume": ("Resume",),
         "rollouts": ("Result", "rollout"),
         "batching": ("batch",),
+        "domain": ("domain",),
         "ode": ("OdeInfo", "OdeResult", "diffeqsolve"),
         "blocks": ("Checkpointed", "StoreAll", "StoreStates"),
         "watch": ("Solves",),

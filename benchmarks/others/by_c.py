@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from .layouts import LANES, NOWHERE, Forms, Program, Scene, of_axes, of_springs, padded, slices, to_springs
+from .layouts import LANES, NOWHERE, Forms, Program, Scene, abreast, of_axes, of_springs, one_by_one, padded, slices, to_springs
 
 THREADS = int(os.environ.get("OMP_NUM_THREADS", "1"))
 FLAGS = ("-O3", "-march=native", "-ffast-math", "-shared", "-fPIC")
@@ -95,18 +95,11 @@ def cloth_gradient(scene: Scene, c: Any, threads: int) -> Program:
 def batch(scene: Scene, c: Any, threads: int) -> Program:
     """Sixteen cloths side by side, so that a register holds one node of each."""
     (ny, nx), offsets = scene["shape"].tolist(), scene["offsets"]
-    n_cloths = len(scene["x"])
-    assert n_cloths % LANES == 0, "whole registers"
-    blocks = n_cloths // LANES
-
-    def abreast(a: np.ndarray) -> np.ndarray:
-        """(B, ..., ny, nx) -> (blocks, ..., ny, nx * 16)."""
-        moved = np.moveaxis(a.reshape(blocks, LANES, *a.shape[1:]), 1, -1)
-        return np.ascontiguousarray(moved).reshape(*moved.shape[:-2], -1)
+    blocks, left = len(scene["x"]) // LANES, LANES * LANES
 
     def bordered(a: np.ndarray, fill: float) -> np.ndarray:
-        out = np.full((blocks, 3, ny + 2, (nx + LANES) * LANES), fill, np.float32)
-        out[..., :ny, LANES * LANES :] = abreast(a.transpose(0, 2, 1).reshape(-1, 3, ny, nx))
+        out = np.full((blocks, 3, ny + 2, nx * LANES + left), fill, np.float32)
+        out[..., :ny, left:] = abreast(a.transpose(0, 2, 1).reshape(-1, 3, ny, nx))
         return out
 
     k = abreast(of_springs(scene["k"], (ny, nx), offsets))
@@ -118,11 +111,7 @@ def batch(scene: Scene, c: Any, threads: int) -> Program:
         x[:, 0], v[...], last[0] = start, speed, n_steps % 2
         c.cloths(blocks, ny, nx, at(k), at(l), at(x), at(v), dt, n_steps, threads)
 
-    def result() -> np.ndarray:
-        inner = x[:, last[0], :, :ny, LANES * LANES :].reshape(blocks, 3, ny * nx, LANES)
-        return inner.transpose(0, 3, 2, 1).reshape(n_cloths, ny * nx, 3)
-
-    return Program(run, result)
+    return Program(run, lambda: one_by_one(x[:, last[0], :, :ny, left:]))
 
 
 def heat(scene: Scene, c: Any, threads: int) -> Program:

@@ -13,10 +13,14 @@ import numba as nb
 import numpy as np
 
 from . import numba_others
-from .layouts import LANES, NOWHERE, Forms, Program, Scene, incident, of_springs, padded, slices, sorted_graph
+from .layouts import LANES, NOWHERE, Forms, Program, Scene, abreast, incident, of_springs, one_by_one, slices, sorted_graph
 
 THREADS = int(os.environ.get("NUMBA_NUM_THREADS", "1"))
 ONE, TINY = np.float32(1), np.float32(1e-30)
+# Columns between two rows, which no spring reaches: those of bend springs.
+BORDER = 2
+# Values of a component that are worked on at a time.
+CHUNK = 1024
 # Of the lattice's families: rows down and columns to the right, from tail to head.
 OFFSETS = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0))
 fast = nb.njit(fastmath=True, error_model="numpy")
@@ -40,10 +44,10 @@ def forms(scene: Scene) -> Forms:
 
 @fast
 def pull_family(k, l, x0, x1, x2, h0, h1, h2, p0, p1, p2, s0, s1, s2):
-    """Pulls of the springs of one row and family, and their sums at the tails. All arrays begin at the row's first node."""
+    """Pulls of the springs of some rows and one family, and their sums at the tails. All arrays begin at the first node."""
     for j in range(len(k)):
         d0, d1, d2 = h0[j] - x0[j], h1[j] - x1[j], h2[j] - x2[j]
-        w = k[j] * (ONE - l[j] / np.sqrt(d0 * d0 + d1 * d1 + d2 * d2))
+        w = k[j] * (ONE - l[j] / np.sqrt(max(d0 * d0 + d1 * d1 + d2 * d2, TINY)))
         p0[j], p1[j], p2[j] = w * d0, w * d1, w * d2
         s0[j] += w * d0
         s1[j] += w * d1
@@ -51,21 +55,22 @@ def pull_family(k, l, x0, x1, x2, h0, h1, h2, p0, p1, p2, s0, s1, s2):
 
 
 @fast
-def pull_row(i, lanes, k, l, x, pulls, sums):
-    """Pulls of a row's springs; those of three rows are kept."""
-    n, left = k.shape[2], LANES * lanes
-    sums[...] = 0
+def pull_rows(begin, end, place, stride, lanes, k, l, x, pulls, sums):
+    """Pulls of the springs whose tails are in rows `begin` to `end`, kept from row `place` on."""
+    n, first, at = (end - begin) * stride, BORDER * lanes + begin * stride, BORDER * lanes + place * stride
+    sums[:, :n] = 0
+    x0, x1, x2 = x[0, first:], x[1, first:], x[2, first:]
     for f in range(len(OFFSETS)):
         down, right = OFFSETS[f]
-        begin = left + right * lanes
-        h, p = x[:, i + down, begin : begin + n], pulls[i % 3, f, :, left : left + n]
-        t = x[:, i, left : left + n]
-        pull_family(k[f, i], l[f, i], t[0], t[1], t[2], h[0], h[1], h[2], p[0], p[1], p[2], sums[0], sums[1], sums[2])
+        head, p = first + down * stride + right * lanes, pulls[f]
+        ks, ls = k[f, first : first + n], l[f, first : first + n]
+        h0, h1, h2 = x[0, head:], x[1, head:], x[2, head:]
+        pull_family(ks, ls, x0, x1, x2, h0, h1, h2, p[0, at:], p[1, at:], p[2, at:], sums[0], sums[1], sums[2])
 
 
 @fast
 def move_component(own, a, b, c, d, e, f, x, to, v, dt):
-    """Velocities and positions of a row, for one component."""
+    """Velocities and positions of some rows, for one component."""
     for j in range(len(own)):
         u = v[j] + dt * (own[j] - a[j] - b[j] - c[j] - d[j] - e[j] - f[j])
         v[j] = u
@@ -73,101 +78,114 @@ def move_component(own, a, b, c, d, e, f, x, to, v, dt):
 
 
 @fast
-def step_rows(begin, end, lanes, k, l, x, to, v, dt):
-    """One step of some rows; those two above are computed for their pulls alone."""
-    n, left, stride = k.shape[2], LANES * lanes, x.shape[2]
-    pulls, sums = np.zeros((3, 6, 3, stride), np.float32), np.zeros((3, n), np.float32)
-    for i in range(max(begin - 2, 0), end):
-        pull_row(i, lanes, k, l, x, pulls, sums)
-        if i >= begin:
-            here, above, top = pulls[i % 3], pulls[(i + 2) % 3], pulls[(i + 1) % 3]
-            for c in range(3):
-                a, b = here[0, c, left - lanes :][:n], here[4, c, left - 2 * lanes :][:n]
-                p, q, r = above[1, c, left:][:n], above[2, c, left - lanes :][:n], above[3, c, left + lanes :][:n]
-                row = (x[c, i, left:][:n], to[c, i, left:][:n], v[c, i, left:][:n])
-                move_component(sums[c], a, b, p, q, r, top[5, c, left:][:n], row[0], row[1], row[2], dt)
+def move_rows(begin, end, stride, lanes, x, to, v, dt, pulls, sums):
+    """What the springs with an end there make of these rows; their own pulls are kept from row 2 on, those of two rows above before."""
+    n, first, at = (end - begin) * stride, BORDER * lanes + begin * stride, BORDER * lanes + 2 * stride
+    for c in range(3):
+        right, below, across = pulls[0, c, at - lanes :], pulls[1, c, at - stride :], pulls[2, c, at - stride - lanes :]
+        back, two, two_below = pulls[3, c, at - stride + lanes :], pulls[4, c, at - 2 * lanes :], pulls[5, c, at - 2 * stride :]
+        rows = (x[c, first:], to[c, first:], v[c, first:])
+        move_component(sums[c, :n], right, below, across, back, two, two_below, rows[0], rows[1], rows[2], dt)
 
 
 @fast
-def cloth_steps(k, l, x, v, dt, n_steps, lanes):
+def step_rows(begin, end, stride, lanes, k, l, x, to, v, dt, pulls, sums):
+    """One step of some rows, several at a time; the two above are computed for their pulls alone."""
+    pulls[:, :, : BORDER * lanes + 2 * stride] = 0
+    above = min(begin, 2)
+    pull_rows(begin - above, begin, 2 - above, stride, lanes, k, l, x, pulls, sums)
+    size = sums.shape[1] // stride
+    for i in range(begin, end, size):
+        last = min(i + size, end)
+        pull_rows(i, last, 2, stride, lanes, k, l, x, pulls, sums)
+        move_rows(i, last, stride, lanes, x, to, v, dt, pulls, sums)
+        for row in range(2):
+            old, new = BORDER * lanes + (last - i + row) * stride, BORDER * lanes + row * stride
+            pulls[:, :, new : new + stride] = pulls[:, :, old : old + stride]
+
+
+@fast
+def work_space(stride, lanes):
+    """Pulls and sums of as many rows as lie well in the cache."""
+    size = max(2, CHUNK // stride)
+    return np.zeros((6, 3, BORDER * lanes + (size + 2) * stride), np.float32), np.zeros((3, size * stride), np.float32)
+
+
+@fast
+def cloth_steps(rows, stride, lanes, k, l, x, v, dt, n_steps):
+    pulls, sums = work_space(stride, lanes)
     for t in range(n_steps):
-        step_rows(0, k.shape[1], lanes, k, l, x[t % 2], x[(t + 1) % 2], v, dt)
+        step_rows(0, rows, stride, lanes, k, l, x[t % 2], x[(t + 1) % 2], v, dt, pulls, sums)
 
 
 @threaded
-def cloth_steps_threaded(k, l, x, v, dt, n_steps, threads):
-    rows = k.shape[1]
+def cloth_steps_threaded(rows, stride, k, l, x, v, dt, n_steps, threads):
+    spaces = [work_space(stride, 1) for _ in range(threads)]
     for t in range(n_steps):
         for part in nb.prange(threads):
-            step_rows(rows * part // threads, rows * (part + 1) // threads, 1, k, l, x[t % 2], x[(t + 1) % 2], v, dt)
+            begin, end = rows * part // threads, rows * (part + 1) // threads
+            step_rows(begin, end, stride, 1, k, l, x[t % 2], x[(t + 1) % 2], v, dt, spaces[part][0], spaces[part][1])
+
+
+def bordered(values: np.ndarray, lanes: int, fill: float) -> np.ndarray:
+    """(..., ny, nx * lanes) -> (..., n) with two columns between rows, two rows below, and a little at both ends: offsets stay inside."""
+    *leading, ny, nx = values.shape
+    wide = np.full((*leading, ny + 3, nx + BORDER * lanes), fill, np.float32)
+    wide[..., :ny, :nx] = values
+    return np.concatenate([np.full((*leading, BORDER * lanes), fill, np.float32), wide.reshape(*leading, -1)], axis=-1)
+
+
+def inner(flat: np.ndarray, ny: int, nx: int, lanes: int) -> np.ndarray:
+    """The way back."""
+    return flat[..., BORDER * lanes :].reshape(*flat.shape[:-1], ny + 3, nx + BORDER * lanes)[..., :ny, :nx]
 
 
 def cloth(scene: Scene, threads: int) -> Program:
     """One cloth; two buffers of positions."""
     (ny, nx), offsets = scene["shape"].tolist(), scene["offsets"]
     assert tuple(map(tuple, offsets.tolist())) == OFFSETS
-    k, l = (of_springs(scene[name], (ny, nx), offsets) for name in ("k", "l"))
-    # A register's length more, so that a row's right border can be read behind the last row too.
-    wide = [np.pad(scene[name].T.reshape(3, ny, nx), ((0, 0), (0, 0), (0, LANES)), constant_values=NOWHERE) for name in ("x", "v")]
-    start, speed = padded(wide[0], NOWHERE), padded(wide[1], 0)
-    x, v, dt, last = np.stack([start, start]), speed.copy(), scene["dt"], [0]
+    k, l = (bordered(of_springs(scene[name], (ny, nx), offsets), 1, 0) for name in ("k", "l"))
+    start, speed = (bordered(scene[name].T.reshape(3, ny, nx), 1, fill) for name, fill in (("x", NOWHERE), ("v", 0)))
+    x, v, dt, last = np.stack([start, start]), speed.copy(), np.float32(scene["dt"]), [0]
 
     def run(n_steps: int) -> None:
         x[0], v[...], last[0] = start, speed, n_steps % 2
         if threads == 1:
-            cloth_steps(k, l, x, v, np.float32(dt), n_steps, 1)
+            cloth_steps(ny, nx + BORDER, 1, k, l, x, v, dt, n_steps)
         else:
-            cloth_steps_threaded(k, l, x, v, np.float32(dt), n_steps, threads)
+            cloth_steps_threaded(ny, nx + BORDER, k, l, x, v, dt, n_steps, threads)
 
-    return Program(run, lambda: x[last[0], :, :ny, LANES : LANES + nx].reshape(3, -1).T)
+    return Program(run, lambda: inner(x[last[0]], ny, nx, 1).reshape(3, -1).T)
 
 
 @fast
-def one_block(k, l, x, v, dt, n_steps):
-    cloth_steps(k, l, x, v, dt, n_steps, LANES)
+def blocks(rows, stride, k, l, x, v, dt, n_steps):
+    for b in range(len(k)):
+        cloth_steps(rows, stride, LANES, k[b], l, x[b], v[b], dt, n_steps)
 
 
 @threaded
-def blocks_threaded(k, l, x, v, dt, n_steps):
+def blocks_threaded(rows, stride, k, l, x, v, dt, n_steps):
     for b in nb.prange(len(k)):
-        one_block(k[b], l, x[b], v[b], dt, n_steps)
-
-
-@fast
-def blocks(k, l, x, v, dt, n_steps):
-    for b in range(len(k)):
-        one_block(k[b], l, x[b], v[b], dt, n_steps)
+        cloth_steps(rows, stride, LANES, k[b], l, x[b], v[b], dt, n_steps)
 
 
 def batch(scene: Scene, threads: int) -> Program:
     """Sixteen cloths side by side, so that a register holds one node of each."""
     (ny, nx), offsets = scene["shape"].tolist(), scene["offsets"]
-    n_cloths, n_blocks = len(scene["x"]), len(scene["x"]) // LANES
-
-    def abreast(a: np.ndarray) -> np.ndarray:
-        """(B, ..., ny, nx) -> (blocks, ..., ny, nx * 16)."""
-        moved = np.moveaxis(a.reshape(n_blocks, LANES, *a.shape[1:]), 1, -1)
-        return np.ascontiguousarray(moved).reshape(*moved.shape[:-2], -1)
-
-    def bordered(a: np.ndarray, fill: float) -> np.ndarray:
-        out = np.full((n_blocks, 3, ny + 2, (nx + 2 * LANES) * LANES), fill, np.float32)
-        out[..., :ny, LANES * LANES : -LANES * LANES] = abreast(a.transpose(0, 2, 1).reshape(-1, 3, ny, nx))
-        return out
-
-    k = abreast(of_springs(scene["k"], (ny, nx), offsets))
-    l = np.repeat(of_springs(scene["l"], (ny, nx), offsets), LANES, axis=-1)
-    start, speed = bordered(scene["x"], NOWHERE), bordered(scene["v"], 0)
+    n_blocks = len(scene["x"]) // LANES
+    k = bordered(abreast(of_springs(scene["k"], (ny, nx), offsets)), LANES, 0)
+    l = bordered(np.repeat(of_springs(scene["l"], (ny, nx), offsets), LANES, axis=-1), LANES, 0)
+    parts = (scene[name].transpose(0, 2, 1).reshape(-1, 3, ny, nx) for name in ("x", "v"))
+    start, speed = (bordered(abreast(part), LANES, fill) for part, fill in zip(parts, (NOWHERE, 0), strict=True))
     x, v, dt, last = np.stack([start, start], axis=1), speed.copy(), np.float32(scene["dt"]), [0]
+    assert x.shape[0] == n_blocks
 
     def run(n_steps: int) -> None:
         x[:, 0], v[...], last[0] = start, speed, n_steps % 2
-        (blocks if threads == 1 else blocks_threaded)(k, l, x, v, dt, n_steps)
+        (blocks if threads == 1 else blocks_threaded)(ny, (nx + BORDER) * LANES, k, l, x, v, dt, n_steps)
 
-    def result() -> np.ndarray:
-        inner = x[:, last[0], :, :ny, LANES * LANES : -LANES * LANES].reshape(n_blocks, 3, ny * nx, LANES)
-        return inner.transpose(0, 3, 2, 1).reshape(n_cloths, ny * nx, 3)
-
-    return Program(run, result)
+    return Program(run, lambda: one_by_one(inner(x[:, last[0]], ny, nx * LANES, LANES)))
 
 
 @fast

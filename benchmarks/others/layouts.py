@@ -108,6 +108,19 @@ def padded(values: np.ndarray, fill: float) -> np.ndarray:
     return out
 
 
+def abreast(values: np.ndarray) -> np.ndarray:
+    """(B, ..., ny, nx) -> (B / 16, ..., ny, nx * 16): sixteen cloths side by side, so that a register holds one node of each."""
+    assert len(values) % LANES == 0, "whole registers"
+    moved = np.moveaxis(values.reshape(-1, LANES, *values.shape[1:]), 1, -1)
+    return np.ascontiguousarray(moved).reshape(*moved.shape[:-2], -1)
+
+
+def one_by_one(values: np.ndarray) -> np.ndarray:
+    """(B / 16, 3, ny, nx * 16) -> (B, ny * nx, 3): the way back."""
+    apart = values.reshape(len(values), 3, -1, LANES)
+    return apart.transpose(0, 3, 2, 1).reshape(len(values) * LANES, -1, 3)
+
+
 def incident(edges: np.ndarray, n_nodes: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(N + 1,) starts, and for each entry the node at the other end and the spring: a compressed table of both ends."""
     ends = np.concatenate([edges[:, 0], edges[:, 1]])

@@ -16,9 +16,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from ._arrays import whole_number
+from ._arrays import own, whole_number
 
 CACHE = 2**18  # bytes of arguments in a chunk: with what a step adds to them they fit the second-level cache of one core
 
@@ -38,8 +38,11 @@ def batch(function: Callable[..., Any], in_axes: Any = 0, *, chunk: int | None =
     Returns:
         The function of batches; every array that it gives has the scenes on its first axis.
 
+    Outside `jax.jit` every call compiles anew: make `jax.jit(js.batch(f))` once.
+
     Raises:
         ValueError: when it is called: axes of different lengths, no axis at all, a number of scenes that the devices cannot share.
+        TypeError: a mesh or an axis that is none; an argument along an axis that is no array.
 
     >>> net = js.lattice(2)
     >>> def length(k):
@@ -50,24 +53,27 @@ def batch(function: Callable[..., Any], in_axes: Any = 0, *, chunk: int | None =
     """
     if chunk is not None and whole_number("chunk", chunk) < 1:
         raise ValueError(f"chunk = {chunk}; expected 1 scene or more, or None.")
+    if mesh is not None and not isinstance(mesh, Mesh):
+        raise TypeError(f"mesh is a {type(mesh).__name__}; expected a jax.sharding.Mesh, e.g. jax.make_mesh((2,), ('scenes',)).")
 
     @functools.wraps(function)
     def of_batch(*arguments: Any) -> Any:
-        axes = in_axes if isinstance(in_axes, tuple) else (in_axes,) * len(arguments)
+        axes = tuple(in_axes) if isinstance(in_axes, tuple | list) else (in_axes,) * len(arguments)
         if len(axes) != len(arguments):
             raise ValueError(f"in_axes = {in_axes} has {len(axes)} entries for {len(arguments)} arguments.")
-        leaves, tree = jax.tree.flatten(jax.tree.map(_as_array, arguments), is_leaf=_is_none)
+        leaves, tree = jax.tree.flatten(arguments, is_leaf=_is_none)
         each = jax.tree.leaves(jax.tree.broadcast(axes, arguments, is_leaf=_is_none), is_leaf=_is_none)
-        is_mapped = [axis is not None and eqx.is_array_like(a) for a, axis in zip(leaves, each, strict=True)]
-        size = _size([(a, axis) for a, axis, m in zip(leaves, each, is_mapped, strict=True) if m])
-        mapped = [jnp.moveaxis(a, axis, 0) for a, axis, m in zip(leaves, each, is_mapped, strict=True) if m]
+        is_mapped = [_is_of_each(a, axis) for a, axis in zip(leaves, each, strict=True)]
+        along = [(own("an argument", a), axis) for a, axis, m in zip(leaves, each, is_mapped, strict=True) if m]
+        size = _size(along)
+        mapped = [jnp.moveaxis(a, axis, 0) for a, axis in along]
         common = [None if m else a for a, m in zip(leaves, is_mapped, strict=True)]
         shared, rest = eqx.partition(common, eqx.is_array)
 
         def of_one(shared: list[Any], mapped: list[Any]) -> Any:
-            own = iter(mapped)
+            each_own = iter(mapped)
             whole = zip(eqx.combine(shared, rest), is_mapped, strict=True)
-            return function(*tree.unflatten([next(own) if m else a for a, m in whole]))
+            return function(*tree.unflatten([next(each_own) if m else a for a, m in whole]))
 
         if mesh is None:
             return _in_chunks(of_one, shared, mapped, size, chunk)
@@ -84,13 +90,19 @@ def batch(function: Callable[..., Any], in_axes: Any = 0, *, chunk: int | None =
         scenes = PartitionSpec(mesh.axis_names)
         # Axes that are not explicit, so that arguments may come from anywhere.
         devices = Mesh(mesh.devices, mesh.axis_names)
-        return jax.shard_map(of_device, mesh=devices, in_specs=(PartitionSpec(), scenes), out_specs=scenes, check_vma=False)(shared, mapped)
+        placed = jax.device_put(shared, NamedSharding(devices, PartitionSpec())), jax.device_put(mapped, NamedSharding(devices, scenes))
+        return jax.shard_map(of_device, mesh=devices, in_specs=(PartitionSpec(), scenes), out_specs=scenes, check_vma=False)(*placed)
 
     return of_batch
 
 
-def _as_array(leaf: Any) -> Any:
-    return jnp.asarray(leaf) if isinstance(leaf, np.ndarray | np.generic) else leaf
+def _is_of_each(leaf: Any, axis: Any) -> bool:
+    """Whether each scene has its own of this leaf. Functions, words and what is None are shared whatever the axis."""
+    if axis is None or leaf is None or isinstance(leaf, str) or (callable(leaf) and not hasattr(leaf, "__array__")):
+        return False
+    if isinstance(axis, bool) or not isinstance(axis, int | np.integer):
+        raise TypeError(f"in_axes holds {axis!r}; expected whole numbers, and None for what all scenes share.")
+    return True
 
 
 def _is_none(leaf: Any) -> bool:
@@ -107,8 +119,8 @@ def _size(mapped: list[tuple[Any, int]]) -> int:
             )
         lengths.add(a.shape[axis])
     if len(lengths) != 1:
-        found = f"axes of different lengths: {sorted(lengths)}" if lengths else "no array with an axis of scenes"
-        raise ValueError(f"There are {found}; expected one number of scenes. See in_axes.")
+        found = f"the arguments have axes of different lengths: {sorted(lengths)}" if lengths else "no argument has an axis of scenes"
+        raise ValueError(f"{found}; expected one number of scenes. See in_axes.")
     return lengths.pop()
 
 

@@ -89,7 +89,7 @@ def cloth_gradient(scene: Scene, c: Any, threads: int) -> Program:
         c.cloth(ny, nx, 1, at(k), at(l), at(x), at(v), dt, n_steps, n_steps + 1, threads)
         c.cloth_gradient(ny, nx, at(k), at(l), at(x), at(g), at(b), at(result), at(result[1]), dt, n_steps, threads)
 
-    return Program(run, lambda: np.stack([to_springs(a, offsets) for a in result]))
+    return Program(run, lambda: np.stack([to_springs(result[i], offsets) for i in range(2)]))
 
 
 def batch(scene: Scene, c: Any, threads: int) -> Program:

@@ -86,8 +86,7 @@ def batch(scene: Scene) -> Program:
     system, net = system_of(scene)
     dt = scene["dt"]
 
-    @eqx.filter_jit
-    def run(x: Any, v: Any, k: Any, n_steps: int) -> Any:
+    def batched(x: Any, v: Any, k: Any, n_steps: int) -> Any:
         def one(x: Any, v: Any, k: Any) -> Any:
             start = js.State.from_points(net, x, v)
             end = js.rollout(js.replace(system, stiffness=k), start, js.SymplecticEuler(), dt, n_steps)
@@ -95,6 +94,7 @@ def batch(scene: Scene) -> Program:
 
         return jax.vmap(one)(x, v, k)
 
+    run: Any = jax.jit(batched, static_argnums=3)
     arrays = [jnp.asarray(scene[name]) for name in ("x", "v", "k")]
     return kept(lambda n: run(*arrays, n), lambda end: end[0])
 
@@ -112,6 +112,7 @@ def _image_program(scene: Scene, function: Callable[[js.Image, Any, Any], Any]) 
     image, x, y = js.Image(scene["image"]), jnp.asarray(scene["x"]), jnp.asarray(scene["y"])
 
     def run(n_steps: int) -> Any:
+        found = None
         for _ in range(n_steps):
             found = jax.block_until_ready(program(image, x, y))
         return found

@@ -4,6 +4,8 @@ Lattices row by row on component arrays, as in C: each spring once, its pulls ke
 three forms, of which the fastest is taken: over springs, over a table of both ends of every node, and over slices of 16 nodes.
 """
 
+# pyright: reportMissingImports=false, reportCallIssue=false
+
 from __future__ import annotations
 
 import os

@@ -180,3 +180,18 @@ def of_axes(scene: Scene) -> np.ndarray:
         part[...] = scene["g"][begin : begin + part.size].reshape(part.shape)
         begin += part.size
     return dense
+
+
+def of_peer(peer: Any, scene: Scene) -> Program:
+    """A peer of `benchmarks.fluid_peers` as a program here."""
+    if peer is None:
+        raise SystemExit("it cannot be imported")
+    last: list[Any] = [None]
+    programs: dict[int, Any] = {}
+
+    def run(n_steps: int) -> None:
+        if n_steps not in programs:  # made once: jax-md's compiles
+            programs[n_steps] = peer.steps(scene.number("dt"), n_steps)
+        last[0], _ = programs[n_steps]()
+
+    return Program(run, lambda: np.asarray(last[0]))

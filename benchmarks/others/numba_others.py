@@ -1,5 +1,7 @@
 """numba on what is no spring net: conduction, samples of images, the liquid of `benchmarks.fluid_peers`."""
 
+# pyright: reportMissingImports=false, reportCallIssue=false
+
 from __future__ import annotations
 
 import importlib
@@ -8,7 +10,7 @@ from typing import Any
 import numba as nb
 import numpy as np
 
-from .layouts import Forms, Program, Scene, of_axes
+from .layouts import Forms, Program, Scene, of_axes, of_peer
 
 TWO = np.float32(2)
 fast = nb.njit(fastmath=True, error_model="numpy")
@@ -112,15 +114,3 @@ def fluid(scene: Scene) -> Program:
     """The list of `benchmarks.fluid_peers`, which imports jax for another peer."""
     peers = importlib.import_module("benchmarks.fluid_peers")
     return of_peer(peers.numba(scene["x"], scene["v"], scene.number("reach"), scene.number("skin")), scene)
-
-
-def of_peer(peer: Any, scene: Scene) -> Program:
-    """A peer of `benchmarks.fluid_peers` as a program here."""
-    if peer is None:
-        raise SystemExit("it cannot be imported")
-    last: list[Any] = [None]
-
-    def run(n_steps: int) -> None:
-        last[0], _ = peer.steps(scene.number("dt"), n_steps)()
-
-    return Program(run, lambda: np.asarray(last[0]))

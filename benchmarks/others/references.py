@@ -168,6 +168,6 @@ def implicit(scene: Scene, n_steps: int) -> np.ndarray:
     dt, step = float(scene["dt"]), Implicit(scene["edges"], len(x), float)
     for _ in range(n_steps):
         matrix, right = step.system(x, v, k, l, dt)
-        v = spsolve(matrix.tocsc(), right).reshape(-1, 3)
+        v = np.asarray(spsolve(matrix.tocsc(), right)).reshape(-1, 3)
         x = x + dt * v
     return x

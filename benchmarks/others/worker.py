@@ -1,19 +1,22 @@
 """One contender in its own process: it reads commands from its standard input, and answers each with a line of JSON.
 
-    python -m benchmarks.others.worker CONTENDER SCENE.npz FOLDER
+    python -m benchmarks.others.worker CONTENDER SCENE.npz FOLDER THREADS
 
     {"do": "forms"}                    the names of its forms of the scene's workload
     {"do": "build", "form": NAME}      seconds to make it and to run it once: what compiles, compiles here
     {"do": "run"}                      seconds of one run
     {"do": "result", "n_steps": 20}    a file with what comes out after so many steps
     {"do": "memory"}                   largest resident memory so far [MiB], and what it was before anything was built
+    {"do": "version", "package": NAME}
 
-It is run by the contender's own Python, with NumPy and nothing else of this project's. What a package prints goes to standard error.
+An answer is {"value": ...} or {"error": why not}. The process keeps to as many processors as it may have threads. It is run by the
+contender's own Python, with NumPy and nothing else of this project's. What a package prints goes to standard error.
 """
 
 from __future__ import annotations
 
 import importlib
+import importlib.metadata
 import json
 import os
 import resource
@@ -43,6 +46,8 @@ class Contender:
             return list(self._forms)
         if command["do"] == "memory":
             return [peak_mib(), self._before]
+        if command["do"] == "version":
+            return importlib.metadata.version(command["package"])
         begin = time.perf_counter()
         if command["do"] == "build":
             self._built = self._forms[command["form"]]()
@@ -58,18 +63,27 @@ class Contender:
 
 def peak_mib() -> float:
     """Largest resident memory of this process so far."""
-    unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20
+    status = Path("/proc/self/status")
+    if status.exists():  # `getrusage` begins with what the parent had when it forked
+        lines = status.read_text().splitlines()
+        return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 2**10
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20  # in bytes, on a Mac
 
 
 def main() -> None:
-    name, scene, folder = sys.argv[1:]
+    name, scene, folder, threads = sys.argv[1:]
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: int(threads)])
     # Answers have a channel of their own: packages print banners.
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     contender = Contender(name, Scene.load(Path(scene)), Path(folder))
     for line in sys.stdin:
-        print(json.dumps(contender.answer(json.loads(line))), file=answers, flush=True)
+        try:
+            answer = {"value": contender.answer(json.loads(line))}
+        except (Exception, SystemExit) as error:  # whatever a peer raises is told, and the next command taken
+            answer = {"error": f"{type(error).__name__}: {error}"[:300]}
+        print(json.dumps(answer), file=answers, flush=True)
 
 
 if __name__ == "__main__":

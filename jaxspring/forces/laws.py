@@ -37,6 +37,14 @@ class Law(eqx.Module):
 
     is_finite_at_zero: ClassVar[bool] = False
 
+    @property
+    def needs_no_mask(self) -> bool:
+        """Whether `is_finite_at_zero` is said of the weight that the law has: by the class that defines it, or one below. A subclass of
+        `Hooke` with another weight says it anew, or is masked.
+        """
+        of_weight, of_flag = (next(c for c in type(self).__mro__ if name in vars(c)) for name in ("weight", "is_finite_at_zero"))
+        return self.is_finite_at_zero and issubclass(of_flag, of_weight)
+
     @abc.abstractmethod
     def weight(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
         """Pull per unit of difference [N/m]; the pull is this times `d`."""

@@ -146,9 +146,9 @@ class Springs(Force):
         if self.net.n_springs == 0:
             return Vector.zeros_like(state.position)
         k, l = self._constants(state)
-        if not self.net.has_margins and self.law.is_finite_at_zero:
+        if not self.net.has_margins and self.law.needs_no_mask:
             k = vanishing(self.net, k)
-        vanishes = isinstance(k, ZeroOutside) and self.law.is_finite_at_zero
+        vanishes = isinstance(k, ZeroOutside) and self.law.needs_no_mask
         if self.net.has_margins and not vanishes:
             return self._embed(self.net.accumulate(self._each(state, _Pull(self.law))), state)
         pull, fields = heeding(self.net, state, _Pull(self.law), k, l)
@@ -273,7 +273,7 @@ class Springs(Force):
         l: Any = changed if changed is not None else cast_inexact(self.net.edge_field(self.rest_length, "rest_length"), state.dtype)
         if self.expansion is None:
             return l
-        factor = cast_inexact(self.expansion, state.dtype).factor(self.net, state)
+        factor = self.net.edge_field(cast_inexact(self.expansion, state.dtype).factor(self.net, state), "factor")
         return map_living(self.net, state, lambda l, factor: l * factor, l, factor)
 
     @property
@@ -291,7 +291,7 @@ class Springs(Force):
 
     def _constants(self, state: State) -> tuple[Array | EdgeField, Array | EdgeField]:
         rule = self.stiffness
-        k = rule.stiffness(self.net, state) if isinstance(rule, StiffnessRule) else self.net.edge_field(rule, "stiffness")
+        k = self.net.edge_field(rule.stiffness(self.net, state) if isinstance(rule, StiffnessRule) else rule, "stiffness")
         return cast_inexact((k, self.natural_length(state)), state.dtype)
 
     def _each(self, state: State, function: Callable[..., Any]) -> EdgeField:
@@ -301,7 +301,7 @@ class Springs(Force):
     def _along(self, state: State) -> tuple[EdgeField, Array | EdgeField, Array | EdgeField]:
         k, l = self._constants(state)
         d = self._near().difference(self._seen(state))
-        return d if self.law.is_finite_at_zero else self._filled(d), k, l
+        return d if self.law.needs_no_mask else self._filled(d), k, l
 
     def _filled(self, d: EdgeField) -> EdgeField:
         """Length above zero in a lattice's margins: there a user's law would be taken at length zero, and its NaN reach the gradient."""

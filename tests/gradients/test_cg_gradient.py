@@ -1,6 +1,5 @@
 """Derivatives through guarded conjugate gradients: implicit, right at every size of the cotangent, and NaN where a solve fails."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +15,7 @@ from tests.step_matrices import near_grid, random_vector, stiff_step
 
 each_solver = pytest.mark.parametrize("solver", [JaxCG, CG])
 NET = js.lattice((4, 5), js.STRUCTURAL + js.SHEAR)
+QUICK = {"xla_backend_optimization_level": 0}  # programs that run once, for milliseconds
 
 
 @pytest.fixture
@@ -99,25 +99,19 @@ def test_adjoint_has_a_tolerance_of_its_own(spd, rng, solver):
     assert np.all(np.isnan(gradient))
 
 
-@pytest.mark.slow
-@each_solver
-@pytest.mark.parametrize("kind", ["blocks", "multigrid"])
-def test_gradient_by_springs_masses_and_forces(rng, solver, kind):
-    """With held nodes, any preconditioner, and a guess: the derivatives of a dense solve, which the preconditioner does not enter."""
+@pytest.fixture(scope="module")
+def dense():
+    """A step with held nodes: its solve by a matrix made anew of four parameters, and value and gradient by a dense solve."""
+    rng = np.random.default_rng(20260101)
     step, b = stiff_step(NET, near_grid(NET, rng), rng, dt_over_limit=10.0), random_vector(NET, rng)
     old = step.matrix.blocks.springs[0]
     held = jnp.ones((4, 5), bool).at[0, 0].set(False).at[3, 4].set(False)
     weights = rng.standard_normal((3, 4, 5))
-    options = {"tolerance": 1e-13} if kind == "blocks" else {"tolerance": 1e-13, "preconditioner": Multigrid(NET)}
 
     def rebuilt(p):
         springs = SpringBlocks(NET, NET.split(p["weight"]), NET.split(p["slope"]), old.direction)
         blocks = Blocks((js.Vector((p["mass"],) * 3),), (), (springs,))
         return SpringMatrix(blocks, (held,) * 3, step.matrix.like, step.matrix.layout)
-
-    def iterated(p):
-        x, _, _ = solver(**options).solve_in_step(rebuilt(p), p["b"], b, None)
-        return sum(jnp.sum(w * jnp.sin(a)) for w, a in zip(weights, x, strict=True))
 
     def direct(p):
         flat = jnp.stack([a.ravel() for a in p["b"]], axis=-1).ravel()
@@ -130,8 +124,23 @@ def test_gradient_by_springs_masses_and_forces(rng, solver, kind):
         "mass": step.matrix.blocks.diagonal[0].x,
         "b": b,
     }
-    value, gradient = eqx.filter_jit(jax.value_and_grad(iterated))(parameters)
-    expected_value, expected = eqx.filter_jit(jax.value_and_grad(direct))(parameters)
+    return rebuilt, weights, parameters, jax.jit(jax.value_and_grad(direct), compiler_options=QUICK)(parameters)
+
+
+@pytest.mark.slow
+@each_solver
+@pytest.mark.parametrize("kind", ["blocks", "multigrid"])
+def test_gradient_by_springs_masses_and_forces(dense, solver, kind):
+    """With held nodes, any preconditioner, and a guess: the derivatives of a dense solve, which the preconditioner does not enter."""
+    rebuilt, weights, parameters, (expected_value, expected) = dense
+    options = {"tolerance": 1e-13} if kind == "blocks" else {"tolerance": 1e-13, "preconditioner": Multigrid(NET)}
+    guess = parameters["b"]
+
+    def iterated(p):
+        x, _, _ = solver(**options).solve_in_step(rebuilt(p), p["b"], guess, None)
+        return sum(jnp.sum(w * jnp.sin(a)) for w, a in zip(weights, x, strict=True))
+
+    value, gradient = jax.jit(jax.value_and_grad(iterated), compiler_options=QUICK)(parameters)
     assert float(value) == pytest.approx(float(expected_value), rel=1e-10)
     for got, known in zip(jax.tree.leaves(gradient), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(got, known, atol=1e-8 * np.abs(known).max())

@@ -19,10 +19,15 @@ NET = js.lattice((3, 4))
 START = np.array([300.0, 310, 320, 330, 305, 315, 325, 380, 352, 361, 370, 390])
 PROBE, HEATER = np.random.default_rng(5).normal(size=24), np.arange(12) == 5
 AT = np.array([340.0, 25.0, 1.5, 1.2, 30.0])
+QUICK = {"xla_backend_optimization_level": 0}  # programs that run for milliseconds
 
 
 def loss(scheme, dt):
-    """A random sum of end temperatures and enthalpies, of [melting, latent, conductivity, capacity, heater power]."""
+    """A random sum of end temperatures and enthalpies, of [melting, latent, conductivity, capacity, heater power].
+
+    The long steps along axes are stored: a step that is computed again is compiled again. The other schemes' go by the default.
+    """
+    adjoint = js.StoreAll() if isinstance(scheme, js.thermal.SplitHeat | js.thermal.SymmetricSplitHeat) else None
 
     def of(p):
         melting, latent, conductivity, capacity, power = p
@@ -34,7 +39,7 @@ def loss(scheme, dt):
         g = js.thermal.conductances(NET, conductivity, 1.0)
         heat = js.Heat(NET, capacity, g, scheme, boundaries, source, latent=js.thermal.LatentHeat(melting, latent))
         start = js.State.from_points(NET, NET.grid(), temperature=START)
-        end = js.rollout(js.System(NET, 1.0, rules=heat), start, js.Still(), dt, 4)
+        end = js.rollout(js.System(NET, 1.0, rules=heat), start, js.Still(), dt, 4, adjoint=adjoint)
         return jnp.sum(PROBE * jnp.concatenate([jnp.ravel(end.state.temperature), jnp.ravel(end.state.enthalpy)])), end.status
 
     return of
@@ -45,10 +50,11 @@ def loss(scheme, dt):
 def test_reverse_mode_is_the_difference(scheme, dt):
     """Melting point, latent heat, conductivity, capacity, heater power, with nodes that melt, a held one and radiation: to 1e-6."""
     of = loss(scheme, dt)
-    gradient, status = jax.jit(jax.grad(of, has_aux=True))(jnp.asarray(AT))
+    gradient, status = jax.jit(jax.grad(of, has_aux=True), compiler_options=QUICK)(jnp.asarray(AT))
     assert int(status.flags) == 0
     steps = 1e-4 * np.diag(AT)
-    values = np.asarray(jax.jit(jax.vmap(lambda p: of(p)[0]))(jnp.asarray(AT + np.concatenate([steps, -steps]))))
+    value = jax.jit(lambda p: of(p)[0], compiler_options=QUICK)
+    values = np.array([value(jnp.asarray(p)) for p in AT + np.concatenate([steps, -steps])])
     differences = (values[:5] - values[5:]) / (2 * np.diag(steps))
     np.testing.assert_allclose(gradient, differences, rtol=1e-6, atol=1e-6 * np.abs(differences).max())
     assert np.all(np.abs(differences) > 1e-4)

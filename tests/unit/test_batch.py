@@ -72,6 +72,33 @@ def test_any_argument_along_any_axis():
         np.testing.assert_allclose(by_constants(np.asarray(k).T), expected, atol=1e-13)
 
 
+def test_what_is_no_array_of_jax():
+    """Whatever the library reads as an array is one along an axis; what is shared stays what it was; functions and words go along."""
+
+    class Table:
+        def __array__(self, dtype=None, copy=None):
+            return np.arange(6.0)
+
+    for given in (Table(), np.arange(6.0).astype(">f8")):
+        np.testing.assert_array_equal(js.batch(lambda a, b: a * b)(np.ones(6), given), np.arange(6.0))
+
+    def steps(k, n_steps, name):
+        assert name == "sheet"
+        return js.rollout(
+            js.System(NET, 1.0, js.Springs(NET, k, 1.0)), js.State.from_points(NET, NET.grid()), js.SymplecticEuler(), 0.01, n_steps
+        )
+
+    for chunk in (None, 1):
+        run = js.batch(steps, [0, None, 0], chunk=chunk)(np.array([1.0, 2.0]), np.int64(3), "sheet")
+        np.testing.assert_allclose(run.state.time, 0.03)
+    with pytest.raises(TypeError, match=r"in_axes holds 0\.5; expected whole numbers"):
+        js.batch(lambda a: a, 0.5)(np.ones(3))
+    with pytest.raises(TypeError, match=r"mesh is a int; expected a jax\.sharding\.Mesh"):
+        js.batch(lambda a: a, mesh=2)
+    with pytest.raises(ValueError, match="masked"):
+        js.batch(lambda a: a)(np.ma.masked_array(np.ones(3), [0, 1, 0]))
+
+
 def test_memory_is_that_of_a_chunk():
     """The temporaries of a gradient over 64 scenes in chunks of 4 are a fraction of those of all at once."""
     points, k, dt = (jnp.tile(a[:1], (64,) + (1,) * (a.ndim - 1)) for a in scenes())
@@ -98,7 +125,7 @@ def test_the_chunk_that_is_chosen():
     [
         ({"chunk": 0}, (), "chunk = 0; expected 1 scene or more"),
         ({}, (np.ones(3), np.ones(4)), r"axes of different lengths: \[3, 4\]"),
-        ({"in_axes": None}, (np.ones(3),), "no array with an axis of scenes"),
+        ({"in_axes": None}, (np.ones(3),), "no argument has an axis of scenes"),
         ({"in_axes": (0,)}, (np.ones(3), 1.0), r"in_axes = \(0,\) has 1 entries for 2 arguments"),
         ({}, (np.ones(3), np.float64(2)), r"an array of shape \(\) has no axis 0 of scenes. Let in_axes be None"),
     ],
@@ -126,6 +153,8 @@ DEVICES = """
     made = jax.make_mesh((2,), ("scenes",))
     np.testing.assert_array_equal(jax.jit(js.batch(scene, mesh=made))(*inputs).state.points, jax.jit(js.batch(scene))(*inputs).state.points)
     np.testing.assert_array_equal(js.batch(scene, mesh=made)(*inputs).status.is_ok, [True] * 8)
+    elsewhere = tuple(jax.device_put(a, jax.devices()[1]) for a in inputs)
+    np.testing.assert_array_equal(js.batch(scene, chunk=2, mesh=made)(*elsewhere).state.points, one(*inputs).state.points)
     found = two(*inputs).state.points
     assert len(found.sharding.device_set) == 2
 

@@ -97,6 +97,59 @@ def test_force_and_derivatives_are_those_from_the_side(name, law):
         np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10 * np.abs(b).max())
 
 
+class Pretension(js.Hooke):
+    """A weight of its own, of which the parent's promise that it vanishes with the stiffness is not true."""
+
+    def weight(self, squared_length, stiffness, rest_length):
+        return super().weight(squared_length, stiffness, rest_length) + 2.0 / jnp.sqrt(squared_length)
+
+
+class Given(js.StiffnessRule):
+    """As many numbers as there are springs, in the user's order."""
+
+    values: jax.Array
+
+    def stiffness(self, net, state):
+        return self.values
+
+    def upper_bound(self):
+        return jnp.max(self.values)
+
+
+class Grown(js.ExpansionRule):
+    """A factor for each spring, in the user's order."""
+
+    values: jax.Array
+
+    def factor(self, net, state):
+        return self.values
+
+
+@pytest.mark.parametrize("name", ["radius", "two hubs", "lattice"])
+def test_what_users_write_is_in_their_order_and_masked(name):
+    """A subclass of a law of the library with another weight; rules that answer with (E,) arrays; as NumPy has it."""
+    net = js.lattice((4, 5), js.STRUCTURAL + js.SHEAR) if name == "lattice" else NETS[name]
+    x, k, l = inputs(net)
+    state = js.State.from_points(net, x)
+    tail, head = net.edges.T
+    d = x[head] - x[tail]
+    r = np.linalg.norm(d, axis=1)
+    cases = {
+        "law": (js.Springs(net, k, l, law=Pretension()), k * (r - l) + 2.0),
+        "stiffness": (js.Springs(net, Given(jnp.asarray(k)), l), k * (r - l)),
+        "expansion": (js.Springs(net, k, l, expansion=Grown(jnp.asarray(k))), k * (r - k * l)),
+    }
+    for springs, tension in cases.values():
+        pull = (tension / r)[:, None] * d
+        expected = np.zeros_like(x)
+        np.add.at(expected, tail, pull)
+        np.add.at(expected, head, -pull)
+        for force in (springs, js.System(net, 1.0, springs).bind("float64").forces[0]):
+            found = np.stack([net.flatten_nodes(a) for a in force.force(state)], axis=1)
+            np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-10 * np.abs(expected).max())
+            np.testing.assert_allclose(net.flatten(force.tension(state)), tension, rtol=1e-10, atol=1e-12)
+
+
 @each_net
 def test_dashpots_are_those_of_numpy(net):
     """Both differences at once: c (v_j - v_i) . u u, summed on the nodes; and nothing of it is left of momentum."""

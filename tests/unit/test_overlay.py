@@ -53,21 +53,36 @@ def test_implicit_steps_and_gradients(base, edges):
     """Backward Euler by conjugate gradients and by Skyline of both nets, and gradients by every constant, are those of the graph alone."""
     (over, state), (alone, own) = scene(base, edges)
     net = over.forces[0].net
-    wanted = js.rollout(alone, own, js.BackwardEuler(), 0.05, 4)
+    quick = {"xla_backend_optimization_level": 0}  # each program runs once, for milliseconds
+
+    def ended(system, state, stepper):
+        return jax.jit(lambda s: js.rollout(system, s, stepper, 0.05, 4), compiler_options=quick)(state)
+
+    wanted = ended(alone, own, js.BackwardEuler())
     for solver in (js.JaxCG(), js.Skyline(base, net)):
-        found = js.rollout(over, state, js.BackwardEuler(solver), 0.05, 4)
+        found = ended(over, state, js.BackwardEuler(solver))
         js.raise_for_status(found)
         np.testing.assert_allclose(found.state.points, wanted.state.points, atol=1e-8)
 
+    # One program for each net: a step that is stored is not compiled again for the way back.
     def end(k, system, state):
-        return jnp.sum(js.rollout(js.replace(system, stiffness=k), state, js.VelocityVerlet(), 0.02, 10).state.points ** 2)
+        run = js.rollout(js.replace(system, stiffness=k), state, js.VelocityVerlet(), 0.02, 10, adjoint=js.StoreAll())
+        return jnp.sum(run.state.points**2)
+
+    def derivatives(k, system, state):
+        gradient = jax.grad(end)(k, system, state)
+        twice = jax.grad(lambda k: jnp.sum(jax.grad(end)(k, system, state) ** 2))(k)
+        return end(k, system, state), gradient, jax.jacfwd(end)(k, system, state), twice
 
     k = jnp.linspace(1, 9, len(edges))
-    for derivative in (jax.grad(end), jax.jacfwd(end)):
-        np.testing.assert_allclose(derivative(k, over, state), derivative(k, alone, own), rtol=1e-9, atol=1e-12)
-    twice = jax.grad(lambda k: jnp.sum(jax.grad(end)(k, over, state) ** 2))(k)
-    np.testing.assert_allclose(twice, jax.grad(lambda k: jnp.sum(jax.grad(end)(k, alone, own) ** 2))(k), rtol=1e-8, atol=1e-10)
-    np.testing.assert_allclose(jax.vmap(lambda k: end(k, over, state))(jnp.stack([k, 2 * k]))[1], end(2 * k, over, state), rtol=1e-12)
+    of_over = jax.jit(lambda k: derivatives(k, over, state), compiler_options=quick)
+    of_alone = jax.jit(lambda k: derivatives(k, alone, own), compiler_options=quick)
+    (_, *first, twice), (_, *known, known_twice) = of_over(k), of_alone(k)
+    for derivative, expected in zip(first, known, strict=True):
+        np.testing.assert_allclose(derivative, expected, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(twice, known_twice, rtol=1e-8, atol=1e-10)
+    lanes = jax.jit(jax.vmap(lambda k: end(k, over, state)), compiler_options=quick)(jnp.stack([k, 2 * k]))
+    np.testing.assert_allclose(lanes[1], of_over(2 * k)[0], rtol=1e-12)
 
 
 class Snapping(js.Rule):

@@ -148,11 +148,11 @@ def every() -> list[Workload]:
     positions, gradient = references.positions, references.gradient
     found = [
         Workload(f"cloth {n}", "cloth", n * n, lambda n=n: cloth(n), steps, steps // 4, LATTICE, positions)
-        for n, steps in ((32, 4000), (128, 1000), (512, 120), (1024, 40))
+        for n, steps in ((32, 4000), (128, 1000), (512, 240), (1024, 100))
     ]
     found += [
         Workload(f"delaunay {n}", "Delaunay mesh", n, lambda n=n: mesh(n), steps, steps // 4, LATTICE, positions)
-        for n, steps in ((1000, 4000), (10_000, 1000), (100_000, 100))
+        for n, steps in ((1000, 4000), (10_000, 1000), (100_000, 200))
     ]
     found += [
         Workload(f"gradient cloth {n}", "gradient, cloth", n * n, lambda n=n: cloth(n, "gradient cloth"), 1000, 200, GRADIENT, gradient)

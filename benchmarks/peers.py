@@ -9,8 +9,8 @@ Lennard-Jones liquid, and implicit steps. All in float32, unit masses, symplecti
 use them. jaxspring is called as a user calls it, with its statuses on.
 
 Contenders, each a process of its own Python: Warp, Newton (its semi-implicit solver), numba, Taichi, jax-md, PyTorch, SciPy, and C that is
-compiled here. Each brings every form of the workload that is known to be fast for it (`benchmarks/others/by_*.py`); the fastest, by the
-best of three runs, takes part. Then one run of each is timed in each round.
+compiled here. Each brings every form of the workload that is known to be fast for it (`benchmarks/others/by_*.py`); the two that are
+fastest in three runs take part, and of these the one with the lower median stands in the table. One run of each is timed in each round.
 
 Read: `M` is million node-steps (points, pairs) a second, the median of the rounds, with `low` and `high` of the seconds (10 and 90 %).
 `ratio` is jaxspring's time over the contender's, the median of the rounds' pairs: above 1, the contender is faster. `error` is the largest

@@ -38,7 +38,7 @@ if TYPE_CHECKING:  # written by `python -m tests.face`
     from .rollouts import Result as Result
     from .rollouts import rollout as rollout
     from .batching import batch as batch
-    from .domain import domain as domain
+    from .sharing import domain as domain
     from .ode import OdeInfo as OdeInfo
     from .ode import OdeResult as OdeResult
     from .ode import diffeqsolve as diffeqsolve

@@ -20,7 +20,7 @@ PUBLIC: dict[str, dict[str, tuple[str, ...]]] = {
         "resume": ("Resume",),
         "rollouts": ("Result", "rollout"),
         "batching": ("batch",),
-        "domain": ("domain",),
+        "sharing": ("domain",),
         "ode": ("OdeInfo", "OdeResult", "diffeqsolve"),
         "blocks": ("Checkpointed", "StoreAll", "StoreStates"),
         "watch": ("Solves",),

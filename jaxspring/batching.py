@@ -24,7 +24,7 @@ CACHE = 2**18  # bytes of arguments in a chunk: with what a step adds to them th
 
 
 def batch(function: Callable[..., Any], in_axes: Any = 0, *, chunk: int | None = None, mesh: Mesh | None = None) -> Callable[..., Any]:
-    """`function` of every scene of a batch, as `jax.vmap` gives it, in chunks; derivatives go through, scene by scene.
+    """The function of every scene of a batch, as `jax.vmap` gives it, in chunks; derivatives go through, scene by scene.
 
     Args:
         function: of one scene: arrays, states, systems in; arrays, states, a `Result` out.
@@ -68,7 +68,8 @@ def batch(function: Callable[..., Any], in_axes: Any = 0, *, chunk: int | None =
         size = _size(along)
         mapped = [jnp.moveaxis(a, axis, 0) for a, axis in along]
         common = [None if m else a for a, m in zip(leaves, is_mapped, strict=True)]
-        shared, rest = eqx.partition(common, eqx.is_array)
+        # NumPy's arrays stay what they are: a number of steps, a list of edges.
+        shared, rest = eqx.partition(common, lambda a: isinstance(a, jax.Array))
 
         def of_one(shared: list[Any], mapped: list[Any]) -> Any:
             each_own = iter(mapped)
@@ -77,21 +78,7 @@ def batch(function: Callable[..., Any], in_axes: Any = 0, *, chunk: int | None =
 
         if mesh is None:
             return _in_chunks(of_one, shared, mapped, size, chunk)
-        if size % mesh.size:
-            raise ValueError(
-                f"{size} scenes cannot be shared by {mesh.size} devices; expected a multiple of {mesh.size}. Repeat some to fill up."
-            )
-
-        n_here = size // mesh.size
-
-        def of_device(shared: list[Any], mapped: list[Any]) -> Any:
-            return _in_chunks(of_one, shared, mapped, n_here, chunk)
-
-        scenes = PartitionSpec(mesh.axis_names)
-        # Axes that are not explicit, so that arguments may come from anywhere.
-        devices = Mesh(mesh.devices, mesh.axis_names)
-        placed = jax.device_put(shared, NamedSharding(devices, PartitionSpec())), jax.device_put(mapped, NamedSharding(devices, scenes))
-        return jax.shard_map(of_device, mesh=devices, in_specs=(PartitionSpec(), scenes), out_specs=scenes, check_vma=False)(*placed)
+        return _on_devices(of_one, shared, mapped, size, chunk, mesh)
 
     return of_batch
 
@@ -122,6 +109,24 @@ def _size(mapped: list[tuple[Any, int]]) -> int:
         found = f"the arguments have axes of different lengths: {sorted(lengths)}" if lengths else "no argument has an axis of scenes"
         raise ValueError(f"{found}; expected one number of scenes. See in_axes.")
     return lengths.pop()
+
+
+def _on_devices(of_one: Callable[..., Any], shared: list[Any], mapped: list[Any], size: int, chunk: int | None, mesh: Mesh) -> Any:
+    """Each device its own scenes."""
+    if size % mesh.size:
+        raise ValueError(
+            f"{size} scenes cannot be shared by {mesh.size} devices; expected a multiple of {mesh.size}. Repeat some to fill up."
+        )
+    n_here = size // mesh.size
+
+    def of_device(shared: list[Any], mapped: list[Any]) -> Any:
+        return _in_chunks(of_one, shared, mapped, n_here, chunk)
+
+    scenes = PartitionSpec(mesh.axis_names)
+    # Axes that are not explicit, so that arguments may come from anywhere.
+    devices = Mesh(mesh.devices, mesh.axis_names)
+    placed = jax.device_put(shared, NamedSharding(devices, PartitionSpec())), jax.device_put(mapped, NamedSharding(devices, scenes))
+    return jax.shard_map(of_device, mesh=devices, in_specs=(PartitionSpec(), scenes), out_specs=scenes, check_vma=False)(*placed)
 
 
 def _in_chunks(of_one: Callable[..., Any], shared: list[Any], mapped: list[Any], size: int, chunk: int | None) -> Any:

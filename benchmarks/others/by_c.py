@@ -19,19 +19,19 @@ THREADS = int(os.environ.get("OMP_NUM_THREADS", "1"))
 FLAGS = ("-O3", "-march=native", "-ffast-math", "-shared", "-fPIC")
 
 
-def library(name: str) -> Any:
-    """A source of this folder, compiled; without OpenMP where the compiler has none."""
+def library(name: str, threads: int) -> Any:
+    """A source of this folder, compiled; with OpenMP for several threads."""
     compiler = shutil.which("cc")
     if compiler is None:
         raise SystemExit("there is no C compiler named cc")
     source = Path(__file__).with_name(f"{name}.c")
+    openmp = "-fopenmp" if threads > 1 else "-fopenmp-simd"
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"{name}.so"
-        for extra in (("-fopenmp",), ()):
-            done = subprocess.run([compiler, *FLAGS, *extra, str(source), "-o", str(path), "-lm"], capture_output=True, text=True)
-            if done.returncode == 0:
-                return ctypes.CDLL(str(path))
-        raise SystemExit(f"cc: {done.stderr.strip().splitlines()[-1]}")
+        done = subprocess.run([compiler, *FLAGS, openmp, str(source), "-o", str(path), "-lm"], capture_output=True, text=True)
+        if done.returncode:
+            raise SystemExit(f"cc: {(done.stderr.strip().splitlines() or ['failed'])[-1]}")
+        return ctypes.CDLL(str(path))
 
 
 def at(array: np.ndarray) -> ctypes.c_void_p:
@@ -54,7 +54,7 @@ def forms(scene: Scene) -> Forms:
         "gradient image": (image, "sampling"),
     }
     function, source = make[kind]
-    return {f"{n} thread{'s' * (n > 1)}": lambda n=n: function(scene, library(source), n) for n in sorted({1, THREADS})}
+    return {f"{n} thread{'s' * (n > 1)}": lambda n=n: function(scene, library(source, n), n) for n in sorted({1, THREADS})}
 
 
 def cloth(scene: Scene, c: Any, threads: int) -> Program:

@@ -58,6 +58,7 @@ void graph(int n, const int *starts, const int *heads, const float *k, const flo
            int history, int threads) {
     const long n_slices = n / LANES;
     const v16 step = dt + (v16){0};
+    Meeting meeting = {0, 0};
 #pragma omp parallel num_threads(threads) if (threads > 1)
     {
         const int me = omp_get_thread_num(), begin = n_slices * me / threads, end = n_slices * (me + 1) / threads;
@@ -76,7 +77,7 @@ void graph(int n, const int *starts, const int *heads, const float *k, const flo
                 put(v + mine, speed);
                 put(to + mine, plus(here, step, speed));
             }
-#pragma omp barrier
+            meet(&meeting, threads);
         }
     }
 }
@@ -91,6 +92,7 @@ void graph_gradient(int n, const int *starts, const int *heads, const float *k, 
         g[i] = 2 * x[n_steps * 4L * n + i];
         b[i] = dt * g[i];
     }
+    Meeting meeting = {0, 0};
 #pragma omp parallel num_threads(threads) if (threads > 1)
     {
         const int me = omp_get_thread_num(), begin = n_slices * me / threads, end = n_slices * (me + 1) / threads;
@@ -113,7 +115,7 @@ void graph_gradient(int n, const int *starts, const int *heads, const float *k, 
                 put(g + mine, of_x);
                 put(to + mine, plus(b_here, step, of_x));
             }
-#pragma omp barrier
+            meet(&meeting, threads);
         }
     }
 }

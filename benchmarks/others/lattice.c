@@ -73,6 +73,7 @@ void cloth(int rows, int n, int lanes, const float *k, const float *l, float *x,
     const Net net = make_net(rows, n, lanes, k, l);
     const long plane = (long)(rows + 2) * net.stride;
     float *const speed[3] = {v, v + plane, v + 2 * plane};
+    Meeting meeting = {0, 0};
 #pragma omp parallel num_threads(threads) if (threads > 1)
     {
         const int me = omp_get_thread_num(), begin = rows * me / threads, end = rows * (me + 1) / threads;
@@ -85,7 +86,7 @@ void cloth(int rows, int n, int lanes, const float *k, const float *l, float *x,
                 pull_row(&net, i, from, pulls);
                 if (i >= begin) move_row(&net, i, pulls, from, to, speed, dt);
             }
-#pragma omp barrier
+            meet(&meeting, threads);
         }
         free(pulls);
     }
@@ -150,6 +151,7 @@ void cloth_gradient(int rows, int n, const float *k, const float *l, float *x, f
                 b[at] = dt * g[at];
             }
     float *const of_x[3] = {g, g + plane, g + 2 * plane};
+    Meeting meeting = {0, 0};
 #pragma omp parallel num_threads(threads) if (threads > 1)
     {
         const int me = omp_get_thread_num(), begin = rows * me / threads, end = rows * (me + 1) / threads;
@@ -164,7 +166,7 @@ void cloth_gradient(int rows, int n, const float *k, const float *l, float *x, f
                 adjoint_row(&net, i, at, from, pulls, mine ? of_k : 0, mine ? of_l : 0, dt);
                 if (mine) back_row(&net, i, pulls, of_x, from, to, dt);
             }
-#pragma omp barrier
+            meet(&meeting, threads);
         }
         free(pulls);
     }
@@ -175,18 +177,22 @@ void cloth_gradient(int rows, int n, const float *k, const float *l, float *x, f
 void heat(int nz, int ny, int nx, const float *gx, const float *gy, const float *gz, float *temperature, float dt, int n_steps,
           int threads) {
     const long row = nx + PAD, layer = (ny + 2) * row, whole = (nz + 2) * layer;
+    Meeting meeting = {0, 0};
 #pragma omp parallel num_threads(threads) if (threads > 1)
-    for (int t = 0; t < n_steps; t++) {
-        const float *restrict old = temperature + (t % 2) * whole;
-        float *restrict new = temperature + ((t + 1) % 2) * whole;
-#pragma omp for schedule(static)
-        for (int z = 1; z <= nz; z++)
-            for (int y = 1; y <= ny; y++) {
-                const long at = z * layer + y * row + PAD - 1;
-                for (long i = at; i < at + nx; i++)
-                    new[i] = old[i] + dt * (gx[i] * (old[i + 1] - old[i]) - gx[i - 1] * (old[i] - old[i - 1])
-                                            + gy[i] * (old[i + row] - old[i]) - gy[i - row] * (old[i] - old[i - row])
-                                            + gz[i] * (old[i + layer] - old[i]) - gz[i - layer] * (old[i] - old[i - layer]));
-            }
+    {
+        const int me = omp_get_thread_num(), begin = 1 + nz * me / threads, end = 1 + nz * (me + 1) / threads;
+        for (int t = 0; t < n_steps; t++) {
+            const float *restrict old = temperature + (t % 2) * whole;
+            float *restrict new = temperature + ((t + 1) % 2) * whole;
+            for (int z = begin; z < end; z++)
+                for (int y = 1; y <= ny; y++) {
+                    const long at = z * layer + y * row + PAD - 1;
+                    for (long i = at; i < at + nx; i++)
+                        new[i] = old[i] + dt * (gx[i] * (old[i + 1] - old[i]) - gx[i - 1] * (old[i] - old[i - 1])
+                                                + gy[i] * (old[i + row] - old[i]) - gy[i - row] * (old[i] - old[i - row])
+                                                + gz[i] * (old[i + layer] - old[i]) - gz[i - layer] * (old[i] - old[i - layer]));
+                }
+            meet(&meeting, threads);
+        }
     }
 }

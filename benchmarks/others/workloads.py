@@ -147,11 +147,11 @@ def every() -> list[Workload]:
     """All workloads, in the order in which they are run."""
     positions, gradient = references.positions, references.gradient
     found = [
-        Workload(f"cloth {n}", "cloth", n * n, lambda n=n: cloth(n), steps, steps // 4, LATTICE, positions)
+        Workload(f"cloth {n}", "cloth", n * n, lambda n=n: cloth(n), steps, steps // 40 * 10, LATTICE, positions)
         for n, steps in ((32, 4000), (128, 1000), (512, 240), (1024, 100))
     ]
     found += [
-        Workload(f"delaunay {n}", "Delaunay mesh", n, lambda n=n: mesh(n), steps, steps // 4, LATTICE, positions)
+        Workload(f"delaunay {n}", "Delaunay mesh", n, lambda n=n: mesh(n), steps, steps // 40 * 10, LATTICE, positions)
         for n, steps in ((1000, 4000), (10_000, 1000), (100_000, 200))
     ]
     found += [

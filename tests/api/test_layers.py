@@ -46,7 +46,7 @@ LAYERS = {
     "rollouts": 6,
     "events": 6,
     "batching": 6,
-    "domain": 6,
+    "sharing": 6,
     "ode": 6,
     "inverse": 7,
     "study": 7,

@@ -200,7 +200,8 @@ NO_ARRAYS = """
     Preconditioner Progress PullLaw Reconstruction Relaxation ReverseCuthillMcKee Rule RungeKutta4 Sampling Secant SemiImplicit
     SimulationError Skyline SoftPositive SplitHeat SpringSettings StabilityWarning Stepper StiffnessRule Still Stop StopReason
     StoreAll StoreStates SymmetricSplitHeat SymplecticEuler Tangent TensionOnly ThermalBoundary Topology Transform Unpreconditioned
-    VelocityVerlet animate batch domain elevation_model energy_ledger equilibrium fit_constants fit_springs from_mesh gradient_magnitude load
+    VelocityVerlet animate batch domain elevation_model
+    energy_ledger equilibrium fit_constants fit_springs from_mesh gradient_magnitude load
     load_image melted_fraction normal_modes principal_curvatures raise_for_status save save_trajectory select smoothing_radius
     stable_dt total_heat
 """

@@ -1,4 +1,4 @@
-"""jax-md's neighbour list and pair sum, as in `benchmarks.fluid_peers`."""
+"""The neighbour list and pair sum of jax-md, as in `benchmarks.fluid_peers`."""
 
 from benchmarks import fluid_peers
 

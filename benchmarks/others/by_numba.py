@@ -1,4 +1,4 @@
-"""numba: the whole loop over steps in one compiled function, on one thread or two.
+"""By numba: the whole loop over steps in one compiled function, on one thread or two.
 
 Lattices row by row on component arrays, as in C: each spring once, its pulls kept in a row until both ends have been reached. Graphs in
 three forms, of which the fastest is taken: over springs, over a table of both ends of every node, and over slices of 16 nodes.

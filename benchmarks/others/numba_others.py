@@ -1,4 +1,4 @@
-"""numba on what is no spring net: conduction, samples of images, the liquid of `benchmarks.fluid_peers`."""
+"""By numba, on what is no spring net: conduction, samples of images, the liquid of `benchmarks.fluid_peers`."""
 
 # pyright: reportMissingImports=false, reportCallIssue=false
 

@@ -16,7 +16,7 @@ def domain(state: State, mesh: Mesh) -> State:
     """The state with the rows of its lattice shared out over devices: whatever runs on it under `jax.jit` runs on all of them.
 
     Args:
-        state: of a lattice; rows are its first axis: the slowest, `ny` of `(ny, nx)`.
+        state: of a lattice; rows are its first axis: the slowest, that of ny in (ny, nx).
         mesh: the devices. Their number must divide that of the rows.
 
     Returns:

@@ -4,8 +4,8 @@
 
 1,024 cloths of 16 x 16 (structural, shear, bend; every scene with its own start and stiffness), symplectic Euler, 100 steps, float32, with
 statuses. Read: `M` is million node-steps a second, `over_vmap` the time over that of `jax.vmap` in the same interleaved rounds. Then
-weak scaling, each in a process of its own: 512 scenes on one host device and one core, 1,024 on two; one cloth of 1,024 rows of 1,024
-nodes on one, of 2,048 rows on two. `efficiency` is the time on one over that on two.
+weak scaling, each in a process of its own: 512 scenes on one host device and one core, 1,024 on two; one cloth of 256 rows of 1,024
+nodes on one, of 512 rows on two. `efficiency` is the time on one over that on two.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def main() -> None:
     n_scenes, rounds = (128, 3) if quick else (1024, 7)
     table = chunks(n_scenes, rounds)
     show(f"{n_scenes} cloths of {N} x {N}", table)
-    scaling, rows = [], 128 if quick else 1024
+    scaling, rows = [], 128 if quick else 256
     for what, size in (("--scenes", n_scenes // 2), ("--rows", rows)):
         one, two = (on_devices(what, n, n * size, rounds) for n in (1, 2))
         scaling += [{"what": what[2:], **row, "efficiency": one["seconds"] / row["seconds"]} for row in (one, two)]
@@ -118,7 +118,7 @@ def main() -> None:
     sizes = [float(row["way"].split("=")[1]) for row in table[2:]]
     curves = {("js.batch", "o-"): (sizes, [row["M"] for row in table[2:]]), ("jax.vmap", "s"): ([float(n_scenes)], [table[0]["M"]])}
     of = {what: [row for row in scaling if row["what"] == what] for what in ("scenes", "rows")}
-    names = {"scenes": "js.batch: 512 cloths per device", "rows": "js.domain: 1,024 rows per device"}
+    names = {"scenes": "js.batch: 512 cloths per device", "rows": "js.domain: 256 rows per device"}
     at = [1.0, 2.0]
     devices = {(names[what], style): (at, [row["M"] for row in of[what]]) for what, style in (("scenes", "o-"), ("rows", "s-"))}
     speed = "million node-steps / s"

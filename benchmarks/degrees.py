@@ -29,8 +29,8 @@ def nets(n: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     flat = np.pad(flat, ((0, 0), (0, 1)))
     around = {k: _within(flat, (k / np.pi) ** 0.5) for k in (12, 30)}
     return {
-        "Delaunay 2-D": (flat, _delaunay(flat[:, :2])),
-        "Delaunay 3-D": (solid, _delaunay(solid)),
+        "Delaunay 2-D": (flat, scenes.delaunay_edges(flat[:, :2])),
+        "Delaunay 3-D": (solid, scenes.delaunay_edges(solid)),
         "radius, 12": (flat, around[12]),
         "radius, 30": (flat, around[30]),
         "power law": (flat, _power_law(n, rng)),
@@ -38,14 +38,6 @@ def nets(n: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         "chain": (flat, np.stack([np.arange(n - 1), np.arange(1, n)], axis=1)),
         "tree": (flat, np.stack([(np.arange(1, n) - 1) // 2, np.arange(1, n)], axis=1)),
     }
-
-
-def _delaunay(points: np.ndarray) -> np.ndarray:
-    from scipy.spatial import Delaunay
-
-    corners = Delaunay(points).simplices
-    pairs = [corners[:, [i, j]] for i in range(corners.shape[1]) for j in range(i)]
-    return np.unique(np.sort(np.concatenate(pairs), axis=1), axis=0)
 
 
 def _within(points: np.ndarray, reach: float) -> np.ndarray:

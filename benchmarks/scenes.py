@@ -26,13 +26,18 @@ def sheet(n: int, seed: int = 0) -> tuple[js.System, js.State]:
 
 def mesh(n_nodes: int, seed: int = 0) -> tuple[js.System, js.State]:
     """Random points in a square, joined by Delaunay's triangulation, in space, float32."""
-    from scipy.spatial import Delaunay
-
     rng = np.random.default_rng(seed)
     points = rng.random((n_nodes, 2)) * np.sqrt(n_nodes)
+    return graph(np.concatenate([points, np.zeros((n_nodes, 1))], axis=1), delaunay_edges(points), rng)
+
+
+def delaunay_edges(points: np.ndarray) -> np.ndarray:
+    """(E, 2) edges of Delaunay's triangulation of (N, 2) or (N, 3) points."""
+    from scipy.spatial import Delaunay
+
     corners = Delaunay(points).simplices
-    edges = np.unique(np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1), axis=0)
-    return graph(np.concatenate([points, np.zeros((n_nodes, 1))], axis=1), edges, rng)
+    pairs = [corners[:, [i, j]] for i in range(corners.shape[1]) for j in range(i)]
+    return np.unique(np.sort(np.concatenate(pairs), axis=1), axis=0)
 
 
 def graph(points: np.ndarray, edges: np.ndarray, rng: np.random.Generator | None = None) -> tuple[js.System, js.State]:

@@ -16,9 +16,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import Mesh
 
 from ._arrays import own, whole_number
+from .sharing import shardings
 
 CACHE = 2**18  # bytes of arguments in a chunk: with what a step adds to them they fit the second-level cache of one core
 
@@ -122,11 +123,9 @@ def _on_devices(of_one: Callable[..., Any], shared: list[Any], mapped: list[Any]
     def of_device(shared: list[Any], mapped: list[Any]) -> Any:
         return _in_chunks(of_one, shared, mapped, n_here, chunk)
 
-    scenes = PartitionSpec(mesh.axis_names)
-    # Axes that are not explicit, so that arguments may come from anywhere.
-    devices = Mesh(mesh.devices, mesh.axis_names)
-    placed = jax.device_put(shared, NamedSharding(devices, PartitionSpec())), jax.device_put(mapped, NamedSharding(devices, scenes))
-    return jax.shard_map(of_device, mesh=devices, in_specs=(PartitionSpec(), scenes), out_specs=scenes, check_vma=False)(*placed)
+    scenes, whole = shardings(mesh)
+    of_all = jax.shard_map(of_device, mesh=scenes.mesh, in_specs=(whole.spec, scenes.spec), out_specs=scenes.spec, check_vma=False)
+    return of_all(jax.device_put(shared, whole), jax.device_put(mapped, scenes))
 
 
 def _in_chunks(of_one: Callable[..., Any], shared: list[Any], mapped: list[Any], size: int, chunk: int | None) -> Any:

@@ -195,6 +195,15 @@ def new_primitive(name: str, evaluate: Any, abstract: Any, batch: Any, jvp: Any 
     return primitive
 
 
+def filled(tangents: PyTree, primals: PyTree) -> PyTree:
+    """Tangents as `eqx.filter_custom_jvp` gives them, with zeros for every None."""
+    return jax.tree.map(_zero_where_none, tangents, primals, is_leaf=lambda leaf: leaf is None)
+
+
+def _zero_where_none(tangent: Any, primal: Any) -> Any:
+    return jax.tree.map(jnp.zeros_like, primal) if tangent is None else tangent
+
+
 def is_zero_tangent(tangent: Any) -> bool:
     """Whether a rule was given no tangent for an argument."""
     return type(tangent) is ad.Zero
@@ -257,6 +266,7 @@ __all__ = [
     "Array",
     "any_lane",
     "cast_inexact",
+    "filled",
     "is_traced",
     "is_zero_tangent",
     "lanes_first",

@@ -40,10 +40,17 @@ def domain(state: State, mesh: Mesh) -> State:
         raise ValueError(f"the state's arrays have shape {state.position[0].shape}; expected one state of a lattice of {shape}.")
     if shape[0] % mesh.size:
         raise ValueError(f"the lattice has {shape[0]} rows, which {mesh.size} devices cannot share; expected a multiple of {mesh.size}.")
-    # Axes that are not explicit, so that whatever is computed from the state may lie as it comes.
-    devices = Mesh(mesh.devices, mesh.axis_names)
-    rows, whole = (NamedSharding(devices, spec) for spec in (PartitionSpec(mesh.axis_names), PartitionSpec()))
+    rows, whole = shardings(mesh)
     return jax.tree.map(lambda a: jax.device_put(a, rows if a.shape == shape else whole), state)
 
 
-__all__ = ["domain"]
+def shardings(mesh: Mesh) -> tuple[NamedSharding, NamedSharding]:
+    """How an array is shared out along its first axis, and how it is whole on every device.
+
+    Along axes that are not explicit: arguments may come from anywhere, and what is computed of them may lie as it comes.
+    """
+    devices = Mesh(mesh.devices, mesh.axis_names)
+    return NamedSharding(devices, PartitionSpec(mesh.axis_names)), NamedSharding(devices, PartitionSpec())
+
+
+__all__ = ["domain", "shardings"]

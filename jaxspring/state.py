@@ -94,7 +94,7 @@ class State(eqx.Module):
     def alive_of(self, net: Topology) -> EdgeField:
         """Which springs of this net hold, a bool edge field; all of them where none breaks."""
         found = field_of(net, self.alive)
-        return net.own(jnp.ones(shape, bool) for shape in net.family_shapes) if found is None else found
+        return net.everywhere(jnp.ones((), bool)) if found is None else found
 
     def rest_length_of(self, net: Topology) -> EdgeField | None:
         """Rest lengths of this net's springs that have changed for good [m], or None."""

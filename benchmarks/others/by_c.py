@@ -81,10 +81,7 @@ def cloth_gradient(scene: Scene, c: Any, threads: int) -> Program:
     dt, result, kept = ctypes.c_float(scene.number("dt")), np.zeros((2, *k.shape), np.float32), {}
 
     def run(n_steps: int) -> None:
-        if n_steps not in kept:
-            kept.clear()
-            kept[n_steps] = np.broadcast_to(start, (n_steps + 1, *start.shape)).copy()
-        x, v, g, b = kept[n_steps], speed.copy(), np.zeros_like(start), np.zeros((2, *start.shape), np.float32)
+        x, v, g, b = _adjoint_arrays(kept, start, speed, n_steps)
         result[...] = 0
         c.cloth(ny, nx, 1, at(k), at(l), at(x), at(v), dt, n_steps, n_steps + 1, threads)
         c.cloth_gradient(ny, nx, at(k), at(l), at(x), at(g), at(b), at(result), at(result[1]), dt, n_steps, threads)
@@ -160,16 +157,21 @@ def mesh(scene: Scene, c: Any, threads: int) -> Program:
     return Program(run, result)
 
 
+def _adjoint_arrays(kept: dict[int, np.ndarray], start: np.ndarray, speed: np.ndarray, n_steps: int) -> tuple[np.ndarray, ...]:
+    """All positions (kept from run to run), velocities, the gradient by the positions, and the adjoint of both."""
+    if n_steps not in kept:
+        kept.clear()
+        kept[n_steps] = np.broadcast_to(start, (n_steps + 1, *start.shape)).copy()
+    return kept[n_steps], speed.copy(), np.zeros_like(start), np.zeros((2, *start.shape), np.float32)
+
+
 def mesh_gradient(scene: Scene, c: Any, threads: int) -> Program:
     """Forward with all positions kept, then the adjoint by hand; each end of a spring finds the same derivative."""
     arguments, table, start, speed = _sliced(scene)
     dt, result, kept = ctypes.c_float(scene.number("dt")), np.zeros((2, len(table.heads)), np.float32), {}
 
     def run(n_steps: int) -> None:
-        if n_steps not in kept:
-            kept.clear()
-            kept[n_steps] = np.broadcast_to(start, (n_steps + 1, *start.shape)).copy()
-        x, v, g, b = kept[n_steps], speed.copy(), np.zeros_like(start), np.zeros((2, *start.shape), np.float32)
+        x, v, g, b = _adjoint_arrays(kept, start, speed, n_steps)
         result[...] = 0
         c.graph(*arguments, at(x), at(v), dt, n_steps, n_steps + 1, threads)
         c.graph_gradient(*arguments, at(x), at(g), at(b), at(result), at(result[1]), dt, n_steps, threads)

@@ -172,8 +172,7 @@ class _Reader:
         """The coordinates of a `Vector`, which is in the net's own order, in the user's; anything else as it is."""
         if not isinstance(value, Vector):
             return value
-        if is_traced(value):
-            raise TypeError(f"{name} is traced (made inside jit, grad or vmap), so it has no numbers to write. Write it outside.")
+        _refuse_traced(name, value)
         if value.shape[-len(self.net.node_shape) :] != self.net.node_shape:
             raise ValueError(f"{name} is a Vector of arrays of shape {value.shape}; the net's nodes have {self.net.node_shape}.")
         return np.stack([np.asarray(self.net.flatten_nodes(a)) for a in value], axis=-1)
@@ -182,8 +181,7 @@ class _Reader:
         """An edge field, of one state or of all frames, in the user's order; anything else as it is."""
         if not isinstance(value, EdgeField):
             return value
-        if is_traced(value):
-            raise TypeError(f"{name} is traced (made inside jit, grad or vmap), so it has no numbers to write. Write it outside.")
+        _refuse_traced(name, value)
         has_frames = self.is_series and [np.shape(a)[1:] for a in value.families] == list(self.net.family_shapes)
         if not has_frames or not value.families:
             return self.net.flatten(self.net.edge_field(value, name))
@@ -197,11 +195,15 @@ def _check_shape(name: str, array: np.ndarray, allowed: dict[str, tuple[int, ...
         raise ValueError(f"{name} has shape {array.shape}; expected {listed}.")
 
 
+def _refuse_traced(name: str, value: Any) -> None:
+    if is_traced(value):
+        raise TypeError(f"{name} is traced (made inside jit, grad or vmap), so it has no numbers to write. Write it outside.")
+
+
 def _numbers(name: str, value: Any) -> np.ndarray:
     """A host array of float32, float64, int32 or booleans, all finite."""
     array = given(name, value)
-    if is_traced(array):
-        raise TypeError(f"{name} is traced (made inside jit, grad or vmap), so it has no numbers to write. Write it outside.")
+    _refuse_traced(name, array)
     array = np.asarray(array)
     if array.dtype == np.bool_:
         return array

@@ -21,13 +21,11 @@ def file_place(path: Path, suffixes: tuple[str, ...], reader: str) -> pathlib.Pa
 
     Raises:
         ValueError: an ending by which no reader would know it.
-        OSError: there is no such folder, or a folder of this name.
+        OSError: there is no such folder above.
     """
     path = pathlib.Path(path)
     if path.suffix.lower() not in suffixes:
         raise ValueError(f"path = {str(path)!r}; {reader} knows the file by its ending: let the name end in {' or '.join(suffixes)}.")
-    if path.is_dir():
-        raise IsADirectoryError(f"{path} is a folder; choose another name for the file.")
     _check_parent(path)
     return path
 

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from ..numerics import linear_call, tiny
+from ..numerics import filled, linear_call, tiny
 from ..vector import Vector
 from .linearisation import Linearisation
 
@@ -192,13 +192,8 @@ def _spring_pull_jvp(primals: Any, tangents: Any) -> tuple[Vector, Vector]:
     pull = spring_pull(law, d, stiffness, rest_length)
     params, static = eqx.partition(law, eqx.is_inexact_array)
     moving = (tangents[1], tangents[2], tangents[3], tangents[0])
-    filled = jax.tree.map(_zero_where_none, moving, (d, stiffness, rest_length, params), is_leaf=lambda leaf: leaf is None)
-    tangent = linear_call(partial(_tangent, static), partial(_tangent_transpose, static), (d, stiffness, rest_length, params), filled)
-    return pull, tangent
-
-
-def _zero_where_none(tangent: Any, primal: Any) -> Any:
-    return jax.tree.map(jnp.zeros_like, primal) if tangent is None else tangent
+    residuals = (d, stiffness, rest_length, params)
+    return pull, linear_call(partial(_tangent, static), partial(_tangent_transpose, static), residuals, filled(moving, residuals))
 
 
 def _tangent(static: Any, residuals: Any, operand: Any) -> Vector:
@@ -285,7 +280,7 @@ def _spring_energy_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
             total = total + jax.jvp(vary, (primals[i],), (tangents[i],))[1]
     if jax.tree.leaves(tangents[0]):
         params, static = eqx.partition(law, eqx.is_inexact_array)
-        moved = jax.tree.map(_zero_where_none, tangents[0], params, is_leaf=lambda leaf: leaf is None)
+        moved = filled(tangents[0], params)
 
         def vary_law(params: Any) -> Array:
             return eqx.combine(params, static).energy(d.dot(d), stiffness, rest_length)

@@ -37,7 +37,7 @@ class Molten(eqx.Module):
         if self.net.n_springs == 0:
             return jnp.ones(self.net.node_shape, bool)
         shapes = self.net.family_shapes
-        all_whole = self.net.own(jnp.ones(shape, bool) for shape in shapes)
+        all_whole = self.net.everywhere(jnp.ones((), bool))
         fields = fields_of(state.alive) or (all_whole,)
         alive = field_of(self.net, fields) or fields[0]
         given = tuple(entry.shape for entry in alive.families)

@@ -28,7 +28,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Int
 
-from ..numerics import linear_call
+from ..numerics import filled, linear_call
 from ..vector import Vector
 
 WIDEST = 64  # springs that a node reads in one column
@@ -211,8 +211,8 @@ def _net_pull(static: Any, moving: tuple[Vector, ...], varying: Any, fixed: Any,
 @_net_pull.def_jvp
 def _net_pull_jvp(primals: Any, tangents: Any) -> tuple[Vector, Vector]:
     static, moving, varying, fixed, ends = primals
-    filled = jax.tree.map(_zero_where_none, (tangents[1], tangents[2]), (moving, varying), is_leaf=lambda leaf: leaf is None)
-    tangent = linear_call(partial(_tangent, static), partial(_tangent_transpose, static), (moving, varying, fixed, ends), filled)
+    steps = filled((tangents[1], tangents[2]), (moving, varying))
+    tangent = linear_call(partial(_tangent, static), partial(_tangent_transpose, static), (moving, varying, fixed, ends), steps)
     return _net_pull(*primals), tangent
 
 
@@ -255,10 +255,6 @@ def _pull(static: Any, fixed: Any, apart: tuple[Vector, ...], shared: Any, each:
     pull, common = eqx.combine(shared, fixed[0], rest)
     own = iter(eqx.combine(each, fixed[1]))
     return pull(*apart, *(next(own) if of_each else field for field, of_each in zip(common, is_spread, strict=True)))
-
-
-def _zero_where_none(tangent: Any, primal: Any) -> Any:
-    return jax.tree.map(jnp.zeros_like, primal) if tangent is None else tangent
 
 
 def _read(a: Array, index: Array) -> Array:

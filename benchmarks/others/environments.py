@@ -1,4 +1,4 @@
-"""An environment of its own for each peer, in `.cache/peers/`, from the versions in `benchmarks/requirements-peers/`.
+"""An environment of its own for each peer, in .cache/peers/, from the versions in `benchmarks/requirements-peers/`.
 
 Not below `benchmarks/`: tests and checkers read every Python file there.
 """

@@ -16,6 +16,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..topology.permutation import locality_order
+
 # Share of the neighbours' average in P: the usual 2/3.
 _SHARE = 2 / 3
 # Groups that a node may belong to: near a hub there could be thousands, and a coarse spring for each pair of them.
@@ -45,7 +47,8 @@ def coarser(springs: Springs) -> Coarser:
     tails, heads, n = springs
     ones = np.ones(2 * len(tails))
     neighbours = csr_array((ones, (np.concatenate([tails, heads]), np.concatenate([heads, tails]))), shape=(n, n))
-    group = _groups([int(i) for i in neighbours.indptr], [int(j) for j in neighbours.indices], n)
+    order = locality_order(np.stack([tails, heads], axis=-1), n)
+    group = _groups([int(i) for i in neighbours.indptr], [int(j) for j in neighbours.indices], [int(i) for i in order])
     n_groups = int(group.max(initial=-1)) + 1
     inside = group >= 0
     member = csr_array((np.ones(inside.sum()), (np.flatnonzero(inside), group[inside])), shape=(n, n_groups))
@@ -60,11 +63,14 @@ def coarser(springs: Springs) -> Coarser:
     return Coarser(springs, spread, combination)
 
 
-def _groups(start: list[int], neighbour: list[int], n: int) -> np.ndarray:
-    """(n,) group of each node, -1 for a node without springs. Nodes whose neighbours are all free found groups; the rest joins one."""
-    group = [-1] * n
+def _groups(start: list[int], neighbour: list[int], order: list[int]) -> np.ndarray:
+    """(n,) group of each node, -1 for a node without springs. Nodes whose neighbours are all free found groups; the rest joins one.
+
+    Asked in an order in which neighbours are near: groups then lie close together, and are few.
+    """
+    group = [-1] * len(order)
     count = 0
-    for i in range(n):
+    for i in order:
         around = neighbour[start[i] : start[i + 1]]
         if group[i] < 0 and around and all(group[j] < 0 for j in around):
             group[i] = count
@@ -72,7 +78,7 @@ def _groups(start: list[int], neighbour: list[int], n: int) -> np.ndarray:
                 group[j] = count
             count += 1
     founded = list(group)
-    for i in range(n):
+    for i in order:
         if group[i] < 0:
             group[i] = next((founded[j] for j in neighbour[start[i] : start[i + 1]] if founded[j] >= 0), -1)
     return np.asarray(group)

@@ -141,5 +141,6 @@ PUBLIC: dict[str, dict[str, tuple[str, ...]]] = {
         "topology.edge_field": ("EdgeField",),
         "topology.base": ("Topology",),
         "topology.overlay": ("Overlay",),
+        "topology.padding": ("NetBatch", "pad_nets"),
     },
 }

@@ -185,7 +185,7 @@ BY_HAND = {"diffeqsolve", "fit", "check_gradient", "frequency_response", "from_n
 
 # What the library makes and hands out; nobody else builds it.
 MADE_INSIDE = """
-    Account Blocks BoundSystem Energy Equilibrium Finding Fit GradientCheck History Iteration Memory Modes NodeDyads
+    Account Blocks BoundSystem Energy Equilibrium Finding Fit GradientCheck History Iteration Memory Modes NetBatch NodeDyads
     OdeInfo OdeResult Overlay Profile Reconstructed Result Resume Scene Selection SkylineFactor SolveInfo Solves
     SpringBlocks SpringMatrix Status Step Surface Undetermined
 """
@@ -200,7 +200,7 @@ NO_ARRAYS = """
     Preconditioner Progress PullLaw Reconstruction Relaxation ReverseCuthillMcKee Rule RungeKutta4 Sampling Secant SemiImplicit
     SimulationError Skyline SoftPositive SplitHeat SpringSettings StabilityWarning Stepper StiffnessRule Still Stop StopReason
     StoreAll StoreStates SymmetricSplitHeat SymplecticEuler Tangent TensionOnly ThermalBoundary Topology Transform Unpreconditioned
-    VelocityVerlet animate batch domain elevation_model
+    VelocityVerlet animate batch domain elevation_model pad_nets
     energy_ledger equilibrium fit_constants fit_springs from_mesh gradient_magnitude load
     load_image melted_fraction normal_modes principal_curvatures raise_for_status save save_trajectory select smoothing_radius
     stable_dt total_heat

@@ -257,9 +257,10 @@ class Springs(Force):
         if self.net.n_springs == 0:
             return None
         d, _, l = self._along(state)
-        # Flat, so that two reductions serve all families. A broken spring has length and rest length zero here, which count for nothing.
-        length = self.net.flatten(map_living(self.net, state, lambda d: d.norm(), d))
-        l = l if living(self.net, state) is None else map_living(self.net, state, lambda l: l, l)
+        if living(self.net, state) is not None:  # broken springs have length and rest length zero, which count for nothing
+            d, l = (map_living(self.net, state, lambda a: a, field) for field in (d, l))
+        # Flat, so that one norm and two reductions serve all families.
+        length = Vector(tuple(self.net.flatten(d.map(lambda of_family, i=i: of_family[i])) for i in range(d[0].dim))).norm()
         rest = self.net.flatten(l) if isinstance(l, EdgeField) else jnp.broadcast_to(l, length.shape)
         never = jnp.full_like(length, jnp.inf)
         finest = jnp.min(jnp.where(rest > 0, jnp.minimum(jnp.where(length > 0, length, never), rest), never))

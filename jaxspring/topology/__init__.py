@@ -10,6 +10,8 @@ if TYPE_CHECKING:  # written by `python -m tests.face`
     from .edge_field import EdgeField as EdgeField
     from .base import Topology as Topology
     from .overlay import Overlay as Overlay
+    from .padding import NetBatch as NetBatch
+    from .padding import pad_nets as pad_nets
     from .lattice import BEND as BEND
     from .lattice import BODY as BODY
     from .lattice import SHEAR as SHEAR

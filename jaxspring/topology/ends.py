@@ -3,9 +3,9 @@
     f_i = sum over the springs at node i of p(x_j - x_i; k, l)        p odd in the difference, so that both ends agree
 
 Each spring has two entries, one at either end. Nodes are put in classes by their number of springs; the entries of a class of n nodes with
-up to c springs are c rows of n, so that a sum over the rows reads memory in order. A node with more than `WIDEST` springs has several
+up to c springs are c rows of n, so that a sum over the rows reads memory in order. A node with very many springs has several
 columns, which are summed in further rounds: a hub costs time and memory in proportion to its springs. Values that are read in every step
-are spread over the entries once, before the loop, and derivatives by them are folded once, after it.
+are spread over the entries once, before the loop, and derivatives by them are folded once, after it. Tables are made in `end_tables.py`.
 
 The transpose of a sum of pulls is the same sum over the same tables: with e = q_j - q_i and J, K the derivatives of p,
 
@@ -24,16 +24,12 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Int
 
 from ..numerics import filled, linear_call
 from ..vector import Vector
 
-WIDEST = 64  # springs that a node reads in one column
-TABLE = 200  # entries that are read in the time that one more class costs: with fewer classes small graphs are faster, and compile sooner
-SHARE = 100  # a class is worth its compile time where it saves this part of all entries
 # Every index is in range by construction; without the test for negative ones programs compile in half the time.
 _SURE: Any = {"mode": "promise_in_bounds", "wrap_negative_indices": False}
 
@@ -86,6 +82,8 @@ class Ends(eqx.Module):
             each hub after the last round.
         classes: of nodes that have springs, in the order of the nodes; the last one that of hubs, if there is any (static).
         count: number of nodes N (static).
+        exists: (E,) False for springs that only fill up, of a net in a batch of nets: copies of the first one, which no entry reads. None
+            where all springs are.
     """
 
     neighbours: Int[Array, " H"]
@@ -99,47 +97,7 @@ class Ends(eqx.Module):
     rounds: tuple[Int[Array, "W rows"], ...]
     classes: tuple[Class, ...] = eqx.field(static=True)
     count: int = eqx.field(static=True)
-
-    @staticmethod
-    def build(pairs: np.ndarray, n_nodes: int) -> tuple[Ends, np.ndarray]:
-        """Tables of the springs between (E, 2) nodes, and the order that the nodes are brought to: node `order[i]` becomes node i."""
-        by_node = np.argsort(pairs.T.ravel(), kind="stable")
-        degree = np.bincount(pairs.ravel(), minlength=n_nodes)
-        start = np.cumsum(degree) - degree
-        width = _widths(degree)
-        order = np.lexsort((np.arange(n_nodes), np.where(width == 0, WIDEST + 2, width)))
-        tails, heads = np.argsort(order)[pairs.T].astype(np.int32)
-        classes, tables, owners, rounds, first, begin = [], [], np.zeros(0, int), (), 0, 0
-        for w in np.unique(width[width > 0]):
-            nodes = order[width[order] == w]
-            n_parts = -(-degree[nodes] // WIDEST)
-            done, of = WIDEST * _counted(n_parts), np.repeat(np.arange(len(nodes)), n_parts)
-            rows = min(int(w), WIDEST)
-            slot, real_to = np.arange(rows)[:, None], np.minimum(degree[nodes][of] - done, WIDEST)
-            real = slot < real_to
-            entries = by_node[start[nodes][of] + done + np.where(real, slot, 0)]
-            tables.append((entries.ravel(), real.ravel()))
-            classes.append(Class(rows, len(of), first, begin, bool(w > WIDEST)))
-            owners, rounds = (first + of, _rounds(n_parts)) if w > WIDEST else (owners, rounds)
-            first, begin = first + len(nodes), begin + entries.size
-        entries, real = (np.concatenate(column) for column in zip(*tables, strict=True)) if tables else (np.zeros(0, int),) * 2
-        places = np.zeros(pairs.size, np.int32)
-        places[entries[real.astype(bool)]] = np.flatnonzero(real)
-        neighbours, (at_tails, at_heads) = np.concatenate([heads, tails])[entries], np.split(places, 2)
-        found = Ends(
-            neighbours=jnp.asarray(neighbours, jnp.int32),
-            owners=jnp.asarray(owners, jnp.int32),
-            entries=jnp.asarray(entries, jnp.int32),
-            real=None if real.all() else jnp.asarray(real),
-            tails=jnp.asarray(tails),
-            heads=jnp.asarray(heads),
-            at_tails=jnp.asarray(at_tails),
-            at_heads=jnp.asarray(at_heads),
-            rounds=tuple(map(jnp.asarray, rounds)),
-            classes=tuple(classes),
-            count=n_nodes,
-        )
-        return found, order
+    exists: Bool[Array, " E"] | None = None
 
     # Linear maps, each with its transpose. Transposes leave out the entries of no spring: pulls and all their derivatives but those by the
     # fields that vanish are zero there.
@@ -274,15 +232,31 @@ def _sum_of_ends(ends: Ends, a: Array) -> Array:
 
 
 def _accumulate(ends: Ends, p: Array) -> Array:
+    p = _with_copies(ends, p)
     return _sum_of_entries(ends, jnp.concatenate([p, -p]))
 
 
 def _minus_accumulate(ends: Ends, p: Array) -> Array:
+    p = _with_copies(ends, p)
     return _sum_of_entries(ends, jnp.concatenate([-p, p]))
 
 
 def _sum_at_nodes(ends: Ends, values: Array) -> Array:
+    values = _with_copies(ends, values)
     return _sum_of_entries(ends, jnp.concatenate([values, values]))
+
+
+def _with_copies(ends: Ends, p: Array) -> Array:
+    """What copies of the first spring have is the first spring's too."""
+    if ends.exists is None:
+        return p
+    copied = jnp.sum(jnp.where(ends.exists, jnp.zeros((), p.dtype), p))
+    return jnp.where(jnp.arange(p.shape[0]) == 0, p + copied, p)
+
+
+def _of_springs(ends: Ends, values: Array) -> Array:
+    """Values of entries, zero where the spring only fills up."""
+    return values if ends.exists is None else jnp.where(ends.exists, values, jnp.zeros((), values.dtype))
 
 
 def _sum_of_entries(ends: Ends, values: Array) -> Array:
@@ -320,7 +294,7 @@ def _spread_vanishing(ends: Ends, a: Array) -> Spread:
 
 def _fold(ends: Ends, values: Spread) -> Array:
     flat = _flat(values)
-    return _read(flat, ends.at_tails) + _read(flat, ends.at_heads)
+    return _of_springs(ends, _read(flat, ends.at_tails) + _read(flat, ends.at_heads))
 
 
 def _apart(ends: Ends, x: Array) -> Spread:
@@ -332,7 +306,7 @@ def _apart(ends: Ends, x: Array) -> Spread:
 def _together(ends: Ends, values: Spread) -> Array:
     """A spring's two values have come from differences of opposite sign."""
     flat = _flat(values)
-    return _minus_accumulate(ends, _read(flat, ends.at_tails) - _read(flat, ends.at_heads))
+    return _minus_accumulate(ends, _of_springs(ends, _read(flat, ends.at_tails) - _read(flat, ends.at_heads)))
 
 
 def _sums(ends: Ends, values: tuple[tuple[Array, ...], ...]) -> tuple[Array, ...]:
@@ -356,40 +330,6 @@ def _over_rows(arrays: Sequence[Array]) -> Sequence[Array]:
     """Sums over the first axis, of all arrays in one pass: one by one, XLA would compute what they share for each of them."""
     zero = jnp.zeros((), arrays[0].dtype)
     return lax.reduce(tuple(arrays), (zero,) * len(arrays), lambda a, b: tuple(x + y for x, y in zip(a, b, strict=True)), (0,))
-
-
-def _counted(numbers: np.ndarray) -> np.ndarray:
-    """0, 1, ... n - 1 for each number n, one after the other."""
-    return np.arange(numbers.sum()) - np.repeat(np.cumsum(numbers) - numbers, numbers)
-
-
-def _rounds(n_parts: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Tables that sum so many columns for each hub; missing entries name the zero that follows the last column."""
-    rounds = []
-    while (n_parts > 1).any():
-        n_rows = -(-n_parts // WIDEST)
-        start = np.repeat(np.cumsum(n_parts) - n_parts, n_rows) + WIDEST * _counted(n_rows)
-        at = start + np.arange(min(WIDEST, n_parts.max()))[:, None]
-        rounds.append(np.where(at < np.repeat(np.cumsum(n_parts), n_rows), at, n_parts.sum()).astype(np.int32))
-        n_parts = n_rows
-    return tuple(rounds)
-
-
-def _widths(degree: np.ndarray) -> np.ndarray:
-    """Width of each node's class, so that entries read, and the cost of a class, are fewest; above `WIDEST` for hubs, 0 for nodes alone."""
-    rows = np.bincount(degree[degree <= WIDEST], minlength=2)
-    rows[0] = 0
-    table = max(TABLE, degree.sum() // SHARE)
-    cost, narrower = np.zeros(len(rows)), np.zeros(len(rows), int)
-    for width in range(1, len(rows)):
-        # One class of this width for all nodes with more than s springs, after the best classes for up to s.
-        costs = [cost[s] + table + width * rows[s + 1 : width + 1].sum() for s in range(width)]
-        narrower[width], cost[width] = np.argmin(costs), np.min(costs)
-    of_degree, width = np.zeros(len(rows), int), len(rows) - 1
-    while width > 0:
-        of_degree[narrower[width] + 1 : width + 1] = width
-        width = narrower[width]
-    return np.where(degree > WIDEST, WIDEST + 1, of_degree[np.minimum(degree, len(rows) - 1)])
 
 
 __all__ = ["Class", "Ends", "Spread"]

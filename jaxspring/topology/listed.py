@@ -19,6 +19,7 @@ from jaxtyping import Array
 from ..vector import Vector
 from .base import Topology
 from .edge_field import AtEnds, EdgeField, ZeroOutside
+from .end_tables import build
 from .ends import Ends, Spread
 from .identity import NetIdentity
 from .periods import minimum_image
@@ -147,7 +148,7 @@ def arranged(pairs: np.ndarray, n_nodes: int) -> tuple[Ends, np.ndarray, Permuta
     near = locality_order(pairs, n_nodes)
     inner = np.argsort(near)[pairs]
     springs = Permutation(np.lexsort((inner.max(axis=1), inner.min(axis=1))))
-    ends, order = Ends.build(inner[springs.order], n_nodes)
+    ends, order = build(inner[springs.order], n_nodes)
     return ends, near[order], springs
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxspring as js
-from jaxspring.topology.ends import WIDEST, Ends
+from jaxspring.topology.end_tables import WIDEST, build
 
 RNG = np.random.default_rng(17)
 
@@ -230,11 +230,11 @@ def test_classes_are_those_of_the_degrees():
     """A node's springs are read in one class of at most `WIDEST`, without a place that holds none where many nodes have as many."""
     n = 4000
     pairs = np.concatenate([[(i, i + 1) for i in range(n - 1)], [(i, i + 2) for i in range(n - 2)]])
-    ends, order = Ends.build(pairs, n)
+    ends, order = build(pairs, n)
     assert [(one.width, one.count) for one in ends.classes] == [(4, n)]  # two nodes with 2 and two with 3 share it
     assert int(np.sum(~np.asarray(ends.real))) == 2 * (1 + 2)
     assert sorted(order) == list(range(n))
-    hub, _ = Ends.build(np.array([(0, i) for i in range(1, 2 * WIDEST + 2)]), 2 * WIDEST + 2)
+    hub, _ = build(np.array([(0, i) for i in range(1, 2 * WIDEST + 2)]), 2 * WIDEST + 2)
     assert [(one.width, one.count, one.is_hubs) for one in hub.classes] == [(1, 2 * WIDEST + 1, False), (WIDEST, 3, True)]
     assert [table.shape for table in hub.rounds] == [(3, 1)]
 

@@ -30,7 +30,7 @@ from .facts import of_functions
 from .linalg.base import SolveInfo
 from .numerics import is_traced, stopped
 from .progress import LONG_RUN, N_CHUNKS, Progress
-from .resume import Origin, Resume, check_kind, checksum, taken_up
+from .resume import Origin, Resume, check_kind, checksum, numbers, taken_up
 from .state import State
 from .status import EXPLANATION, WARNINGS, Flag, StabilityWarning, Status
 from .steppers.base import Stepper
@@ -223,7 +223,7 @@ def _fresh(system: System, ready: BoundSystem, state: State, start: State, job: 
     """Where nothing goes on."""
     zero = jnp.zeros((), jnp.int32)
     memory, origin = job.stepper.init(ready, start), Origin.of(system, state, job.stepper)
-    constants = checksum((system, job.stepper))
+    constants = checksum(numbers((system, job.stepper)))
     return Resume(state.time, zero, zero, state.time, job.dt, memory, constants, jnp.zeros((), jnp.uint32), origin)
 
 

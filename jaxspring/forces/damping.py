@@ -20,14 +20,12 @@ from .._checks import node_values, nonnegative
 from ..linalg.operators import Blocks, SpringBlocks, isotropic
 from ..numerics import cast_inexact, tiny
 from ..state import State
-from ..status import Flag
 from ..topology.base import Topology
 from ..topology.edge_field import EdgeField, SpringNumbers, ZeroOutside
 from ..vector import Vector
 from .base import Finding, Force, Scene, any_refused
 from .in_box import long_springs, turned_springs
-from .laws import has_no_direction
-from .lengths import beyond_range
+from .lengths import are_apart, beyond_range, blind, squared_lengths
 from .living import counted, heeding, living, map_living, vanishing
 from .springs import _check_sign, _edge_constant
 
@@ -140,14 +138,10 @@ class Dashpots(Force):
         if self.net.n_springs == 0:
             return ()
 
-        def near(d: Vector) -> Array:
-            is_apart = jnp.max(jnp.abs(jnp.stack(tuple(d))), axis=0) > 0
-            return (has_no_direction(d) & is_apart).astype(jnp.int32)
-
-        d = self.net.difference(state.position)
-        blind = Finding(Flag.COINCIDENT, self.net.sum(map_living(self.net, state, near, d)), jnp.asarray(-1, jnp.int32))
-        far = beyond_range(self.net, self.net, state, state.position)
-        return (blind, far, *long_springs(self.net, state.position, living(self.net, state)))
+        of_dampers = (self.net, self.net, state, state.position)
+        squared = squared_lengths(*of_dampers)
+        found = blind(squared, are_apart(*of_dampers)), beyond_range(squared, state.position)
+        return (*found, *long_springs(self.net, state.position, living(self.net, state)))
 
     def diagnose_since(self, start: State, state: State) -> tuple[Finding, ...]:
         """BOX: dampers that act toward another image than at the start."""

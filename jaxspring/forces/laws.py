@@ -289,17 +289,6 @@ def _spring_energy_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
     return energy, total
 
 
-def has_no_direction(d: Vector) -> Array:
-    """Where a difference is so short that its square counts as zero."""
-    squared = d.dot(d)
-    return squared <= tiny(squared.dtype)
-
-
-def is_beyond_range(d: Vector) -> Array:
-    """Where the square of a length overflows: from about 1.8e19 m on in float32. What a law then makes of it is no number to trust."""
-    return jnp.isinf(d.dot(d))
-
-
 def _inverse_length(squared: Array) -> Array:
     return lax.rsqrt(jnp.maximum(squared, tiny(squared.dtype)))
 

@@ -23,15 +23,14 @@ from .._checks import finite, is_concrete, nonnegative, positive
 from ..linalg.operators import Blocks, SpringBlocks
 from ..numerics import cast_inexact, tiny
 from ..state import State
-from ..status import Flag
 from ..topology.base import Topology
 from ..topology.edge_field import EdgeField, SpringNumbers, ZeroOutside
 from ..topology.periods import box_of
 from ..vector import Vector
 from .base import Finding, Force, Scene, any_refused
 from .in_box import along_axes, check_rest_length, long_springs, turned_springs
-from .laws import Hooke, Law, PowerLaw, TensionOnly, has_no_direction, length_of, spring_block, spring_energy, spring_pull
-from .lengths import beyond_range
+from .laws import Hooke, Law, PowerLaw, TensionOnly, length_of, spring_block, spring_energy, spring_pull
+from .lengths import are_apart, beyond_range, blind, squared_lengths
 from .linearisation import Linearisation
 from .living import counted, existing, heeding, living, map_living, vanishing
 
@@ -224,14 +223,11 @@ class Springs(Force):
             # A pull k d takes no square.
             return in_box
 
-        def coincident(d: Vector, _: Array, l: Array) -> Array:
-            needs_direction = l > 0
-            if not is_linear:
-                needs_direction = needs_direction | (jnp.max(jnp.abs(jnp.stack(tuple(d))), axis=0) > 0)
-            return (has_no_direction(d) & needs_direction).astype(jnp.int32)
-
-        at_one_place = Finding(Flag.COINCIDENT, self.net.sum(self._each(state, coincident)), jnp.asarray(-1, jnp.int32))
-        return (*in_box, at_one_place, beyond_range(self.net, self._near(), state, self._seen(state)))
+        of_springs = (self.net, self._near(), state, self._seen(state))
+        squared, l = squared_lengths(*of_springs), self.natural_length(state)
+        has_rest = (self.net.joined(l) if isinstance(l, EdgeField) else l) > 0
+        at_one_place = blind(squared, has_rest if is_linear else has_rest | are_apart(*of_springs))
+        return (*in_box, at_one_place, beyond_range(squared, self._seen(state)))
 
     def diagnose_since(self, start: State, state: State) -> tuple[Finding, ...]:
         """BOX: springs that pull to another image than at the start."""
@@ -260,8 +256,8 @@ class Springs(Force):
         if living(self.net, state) is not None:  # broken springs have length and rest length zero, which count for nothing
             d, l = (map_living(self.net, state, lambda a: a, field) for field in (d, l))
         # Flat, so that one norm and two reductions serve all families.
-        length = Vector(tuple(self.net.flatten(d.map(lambda of_family, i=i: of_family[i])) for i in range(d[0].dim))).norm()
-        rest = self.net.flatten(l) if isinstance(l, EdgeField) else jnp.broadcast_to(l, length.shape)
+        length = Vector(tuple(self.net.joined(d.map(lambda of_family, i=i: of_family[i])) for i in range(d[0].dim))).norm()
+        rest = self.net.joined(l) if isinstance(l, EdgeField) else jnp.broadcast_to(l, length.shape)
         never = jnp.full_like(length, jnp.inf)
         finest = jnp.min(jnp.where(rest > 0, jnp.minimum(jnp.where(length > 0, length, never), rest), never))
         longest = jnp.max(jnp.where(rest > 0, jnp.zeros_like(length), length))

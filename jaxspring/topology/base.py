@@ -171,6 +171,10 @@ class Topology(eqx.Module):
     def _flatten(self, field: EdgeField) -> Array:
         """Edge field in full shape -> (E,) array in the user's order."""
 
+    def joined(self, field: EdgeField) -> Array:
+        """Edge field -> (E,) array in the net's own order, for sums and extremes over all springs."""
+        return self._flatten(self._spread(field))
+
     def named(self, name: str | None) -> Self:
         """The same net under a name: a set of springs of its own, with its own broken springs, though another net has the same edges.
 

@@ -126,6 +126,10 @@ class ListedSprings(Topology):
         """(E,) array in the user's order -> edge field."""
         return self.own((self.springs.inward(flat),))
 
+    def joined(self, field: EdgeField) -> Array:
+        """Edge field -> (E,) array as it is kept."""
+        return self._spread(field).families[0]
+
     def _flatten(self, field: EdgeField) -> Array:
         """Edge field -> (E,) array in the user's order."""
         return self.springs.outward(field.families[0])

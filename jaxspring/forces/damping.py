@@ -25,7 +25,7 @@ from ..topology.edge_field import EdgeField, SpringNumbers, ZeroOutside
 from ..vector import Vector
 from .base import Finding, Force, Scene, any_refused
 from .in_box import long_springs, turned_springs
-from .lengths import are_apart, beyond_range, blind, squared_lengths
+from .lengths import are_apart, too_short_or_long
 from .living import counted, heeding, living, map_living, vanishing
 from .springs import _check_sign, _edge_constant
 
@@ -138,9 +138,8 @@ class Dashpots(Force):
         if self.net.n_springs == 0:
             return ()
 
-        of_dampers = (self.net, self.net, state, state.position)
-        squared = squared_lengths(*of_dampers)
-        found = blind(squared, are_apart(*of_dampers)), beyond_range(squared, state.position)
+        d, nothing = self.net.difference(state.position), jnp.zeros((), state.dtype)
+        found = too_short_or_long(self.net, state, lambda d, _: are_apart(d), d, nothing)
         return (*found, *long_springs(self.net, state.position, living(self.net, state)))
 
     def diagnose_since(self, start: State, state: State) -> tuple[Finding, ...]:

@@ -1,61 +1,52 @@
-"""Lengths of all springs of a net in one array, for the looks of a status: one loop serves all families, and compiles sooner.
+"""Springs and dampers that are too short or too long for the square of their length: what a law makes of it is no number to trust.
 
-Springs and dampers so long that the square of their length overflows have no number to trust:
-
-    |r| <= 2 sqrt(D) max |x|        none is counted before the coordinates are large enough for the longest to be beyond the range
+r.r <= tiny         the square underflows: no direction is left            COINCIDENT, where the spring needs one
+r.r = inf           the square overflows                                   NONFINITE
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array
 
-from ..numerics import any_lane, tiny
+from ..numerics import tiny
 from ..state import State
 from ..status import Flag
 from ..topology.base import Topology
+from ..topology.edge_field import EdgeField
 from ..vector import Vector
 from .base import Finding
-from .living import living
+from .living import map_living
 
 
-def squared_lengths(net: Topology, near: Topology, state: State, seen: Vector) -> Array:
-    """(E,) squares [m^2] in the net's own order, 1 of a broken spring.
+def too_short_or_long(
+    net: Topology, state: State, needs: Callable[[Vector, Array], Array], d: EdgeField, l: Array | EdgeField
+) -> tuple[Finding, Finding]:
+    """COINCIDENT and NONFINITE: how many springs of each kind, broken ones left out, counted in one pass over the memory.
 
     Args:
         net: the topology.
-        near: the same with the periods of the coordinates between which the springs run.
         state: with `alive`, which is heeded.
-        seen: these coordinates.
+        needs: whether springs of a family need a direction, of their differences and their `l`.
+        d: differences along the springs.
+        l: a number, or one for each spring.
     """
-    return _of_living(net, state, net.joined(near.difference(seen).map(lambda d: d.dot(d))))
+
+    def of_family(d: Vector, l: Array) -> tuple[Array, Array]:
+        squared = d.dot(d)
+        return (squared <= tiny(squared.dtype)) & needs(d, l), jnp.isinf(squared)
+
+    found = map_living(net, state, of_family, d, l)
+    short, long = net.counts(*(found.map(lambda pair, i=i: pair[i]) for i in (0, 1)))
+    nowhere = jnp.asarray(-1, jnp.int32)
+    return Finding(Flag.COINCIDENT, short, nowhere), Finding(Flag.NONFINITE, long, nowhere)
 
 
-def are_apart(net: Topology, near: Topology, state: State, seen: Vector) -> Array:
-    """(E,) whether the ends of each spring are at two places, however near."""
-    largest = net.joined(near.difference(seen).map(lambda d: jnp.max(jnp.abs(jnp.stack(tuple(d))), axis=0)))
-    return _of_living(net, state, largest) > 0
+def are_apart(d: Vector) -> Array:
+    """Whether the ends of springs are at two places, however near."""
+    return jnp.max(jnp.abs(jnp.stack(tuple(d))), axis=0) > 0
 
 
-def blind(squared: Array, counts: Array | bool) -> Finding:
-    """COINCIDENT: how many springs of those that count are so short that their square underflows: they have no direction."""
-    is_short = (squared <= tiny(squared.dtype)) & counts
-    return Finding(Flag.COINCIDENT, jnp.sum(is_short.astype(jnp.int32), dtype=jnp.int32), jnp.asarray(-1, jnp.int32))
-
-
-def beyond_range(squared: Array, seen: Vector) -> Finding:
-    """NONFINITE: how many springs are too long."""
-    largest = seen.largest()
-    safe = (float(jnp.finfo(largest.dtype).max) / (8 * seen.dim)) ** 0.5
-    is_far = any_lane(~(largest < safe))
-    n = lax.cond(is_far, lambda s: jnp.sum(jnp.isinf(s).astype(jnp.int32), dtype=jnp.int32), lambda _: jnp.zeros((), jnp.int32), squared)
-    return Finding(Flag.NONFINITE, n, jnp.asarray(-1, jnp.int32))
-
-
-def _of_living(net: Topology, state: State, values: Array) -> Array:
-    alive = living(net, state)
-    return values if alive is None else jnp.where(net.joined(alive), values, jnp.ones((), values.dtype))
-
-
-__all__ = ["are_apart", "beyond_range", "blind", "squared_lengths"]
+__all__ = ["are_apart", "too_short_or_long"]

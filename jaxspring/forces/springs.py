@@ -30,7 +30,7 @@ from ..vector import Vector
 from .base import Finding, Force, Scene, any_refused
 from .in_box import along_axes, check_rest_length, long_springs, turned_springs
 from .laws import Hooke, Law, PowerLaw, TensionOnly, length_of, spring_block, spring_energy, spring_pull
-from .lengths import are_apart, beyond_range, blind, squared_lengths
+from .lengths import are_apart, too_short_or_long
 from .linearisation import Linearisation
 from .living import counted, existing, heeding, living, map_living, vanishing
 
@@ -223,11 +223,9 @@ class Springs(Force):
             # A pull k d takes no square.
             return in_box
 
-        of_springs = (self.net, self._near(), state, self._seen(state))
-        squared, l = squared_lengths(*of_springs), self.natural_length(state)
-        has_rest = (self.net.joined(l) if isinstance(l, EdgeField) else l) > 0
-        at_one_place = blind(squared, has_rest if is_linear else has_rest | are_apart(*of_springs))
-        return (*in_box, at_one_place, beyond_range(squared, self._seen(state)))
+        d = self._near().difference(self._seen(state))
+        needs = (lambda _, l: l > 0) if is_linear else (lambda d, l: (l > 0) | are_apart(d))
+        return (*in_box, *too_short_or_long(self.net, state, needs, d, self.natural_length(state)))
 
     def diagnose_since(self, start: State, state: State) -> tuple[Finding, ...]:
         """BOX: springs that pull to another image than at the start."""

@@ -19,6 +19,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array
 
 from .. import printing
@@ -64,6 +65,15 @@ def about_middle(points: Any) -> Any:
     is_held = jax.dtypes.canonicalize_dtype(np.float64) == np.float64
     # What is not finite must not spread to the others: it is refused later, by its index.
     return points if is_held or not np.isfinite(points).all() else points - points.mean(axis=0)
+
+
+def _of_rows(a: Array, b: Array) -> tuple[Array, Array]:
+    """Sums along the last axis, in one row."""
+    if a.ndim == 1:
+        return jnp.sum(a, dtype=a.dtype, keepdims=True), jnp.sum(b, dtype=b.dtype, keepdims=True)
+    zero = jnp.zeros((), a.dtype)
+    found = lax.reduce((a, b), (zero, zero), lambda x, y: (x[0] + y[0], x[1] + y[1]), (a.ndim - 1,))
+    return found[0].reshape(-1), found[1].reshape(-1)
 
 
 class Topology(eqx.Module):
@@ -247,6 +257,16 @@ class Topology(eqx.Module):
     def sum(self, field: EdgeField) -> Array:
         """Sum of a field over all springs."""
         return sum((jnp.sum(entry, dtype=field.dtype) for entry in self.inside(field, 0).families), start=jnp.zeros((), field.dtype))
+
+    def counts(self, first: EdgeField, second: EdgeField) -> tuple[Array, Array]:
+        """For how many springs each of two conditions holds, int32."""
+        pairs = zip(self.inside(first, False).families, self.inside(second, False).families, strict=True)
+        # Both in one reduction: XLA makes one loop of it and of what it counts, where it would store what a single one counts.
+        rows = [_of_rows(a.astype(jnp.int32), b.astype(jnp.int32)) for a, b in pairs]
+        if not rows:
+            return jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32)
+        one, other = (jnp.sum(jnp.concatenate(column), dtype=jnp.int32) for column in zip(*rows, strict=True))
+        return one, other
 
     def map_springs(self, law: Callable[..., Any], *fields: Any) -> EdgeField:
         """Call `law` once per spring family; a number or 0-d array is passed to every family as it is."""

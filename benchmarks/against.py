@@ -7,7 +7,7 @@ Three processes hold the same workloads: this checkout, this checkout once more,
 round. Read: `ratio` is the time of this checkout over the other's, the median of the rounds' pairs, with the lowest and the highest;
 `itself` is the same for this checkout against itself, so that its spread says what the machine alone does. A workload counts as slower
 where its median is above 1.03 and above the spread of `itself`; then the exit code is 1. `compile` is the ratio of the seconds to
-trace, compile and run once.
+trace, compile and run once: of a gradient, until the first one is there; `compile_s` (gradients: `first_gradient_s`) are these seconds.
 """
 
 from __future__ import annotations
@@ -133,6 +133,8 @@ def compare(names: list[str], other: Path, rounds: int) -> list[dict[str, Any]]:
             "itself_low": float(itself.min()),
             "itself_high": float(itself.max()),
             "compile": first[1] / first[0],
+            "compile_s": None if name.startswith("gradient") else first[1],
+            "first_gradient_s": first[1] if name.startswith("gradient") else None,
         }
         row["slower"] = bool(row["ratio"] > max(SLOWER, row["itself_high"], 1 / row["itself_low"]))
         rows.append(row)

@@ -5,8 +5,8 @@
 Lennard-Jones, its force shifted to zero at 2.5 sigma, skin 0.3, liquid density 0.8, float32, 1e3 to 1e5 particles in open space. Beside it,
 where they are installed: jax-md, Warp's hash grid, a list in numba. Read: `M` is million pairs within the cut-off a second, each counted
 once, the median of interleaved rounds, each a burst of at least 20 ms; `error` is the largest difference from the float64 sum over all
-pairs, over the largest force. `gradient` is that of the squared forces by the positions, in forces. `compile_s` is the first run, in which the
-others compile as well.
+pairs, over the largest force. `gradient` is that of the squared forces by the positions, in forces. `compile_s` is the first run, in
+which others compile as well.
 In full steps (100 of velocity Verlet, speeds of temperature 1) the list is remade when it must be, Warp's grid in each; `apart` is how far
 the points end from ours, in sigma; the pairs are those at the start. Draws rates and steps.
 """

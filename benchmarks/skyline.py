@@ -229,7 +229,19 @@ def main() -> None:
         rows = [solve_once(case, rounds) for case in cases]
         chosen = ("cloth 32 x 32, blocks",) if quick else ("cloth 64 x 64, scalar", "cloth 32 x 32, blocks", "mesh of 5000, scalar")
         reused = [reuse(case, 3) for case in cases if case.name in chosen]
-    columns = ("case", "order", "entries", "stored_over", "factor_s", "solve_s", "gflops", "over_banded", "over_superlu", "compile_s", "residual")
+    columns = (
+        "case",
+        "order",
+        "entries",
+        "stored_over",
+        "factor_s",
+        "solve_s",
+        "gflops",
+        "over_banded",
+        "over_superlu",
+        "compile_s",
+        "residual",
+    )
     show("factor and solve", [{name: row[name] for name in columns} for row in rows])
     show(
         "the same of SciPy",

@@ -241,5 +241,8 @@ def _fitted(path: Path, name: str, arrays: Mapping[str, np.ndarray], leaf: Any) 
 
 
 def _placed(array: Any, leaf: Any) -> Any:
-    """The array of JAX on the devices of `leaf`, where that is one."""
-    return placed(array, getattr(leaf, "sharding", None)) if isinstance(leaf, jax.Array | jax.ShapeDtypeStruct) else array
+    """The array of JAX on the devices of `leaf`, where that is one; what was put nowhere is put nowhere."""
+    if not isinstance(leaf, jax.Array | jax.ShapeDtypeStruct):
+        return array
+    is_bound = isinstance(leaf, jax.ShapeDtypeStruct) or getattr(leaf, "committed", False)
+    return placed(array, leaf.sharding if is_bound else None)

@@ -43,8 +43,8 @@ def spread(tree: PyTree, sharding: Sharding) -> PyTree:
 
 
 def placed(array: np.ndarray, sharding: Sharding | None) -> Array:
-    """An array of this host laid out as told, each process taking its part; on the default device where that is one device, or None."""
-    if sharding is None or sharding.num_devices == 1:
+    """An array of this host laid out as told, each process taking its part; wherever JAX puts arrays where nothing is told."""
+    if sharding is None:
         return jnp.asarray(array)
     return jax.make_array_from_callback(array.shape, sharding, lambda index: array[index])
 

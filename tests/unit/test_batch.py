@@ -160,7 +160,7 @@ DEVICES = """
     js.save(sys.argv[1], two(*inputs))
     for like in (one(*inputs), two(*inputs)):
         read = js.load(sys.argv[1], like=like)
-        assert read.state.points.sharding.device_set == like.state.points.sharding.device_set
+        assert read.state.position.x.sharding.device_set == like.state.position.x.sharding.device_set
         jax.tree.map(np.testing.assert_array_equal, read, like)
 
     def loss(map_of, k):

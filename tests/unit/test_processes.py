@@ -10,10 +10,12 @@ import time
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxspring as js
+from jaxspring import processes
 from jaxspring.processes import gathered, is_spread, placed
 
 NET = js.lattice((2, 3))
@@ -172,9 +174,34 @@ def test_two_processes_compute_what_one_does(pair, tmp_path):
 
 
 def test_one_process_holds_all_that_it_has():
-    """Nothing is spread where there is one process; what is gathered is what was given."""
-    tree = {"a": jax.numpy.arange(3.0), "b": 1.0, "c": None, "d": len}
+    """Nothing is spread where there is one process; what is gathered is what was given, and what is placed lies as told."""
+    tree = {"a": jnp.arange(3.0), "b": 1.0, "c": None, "d": len}
     assert not is_spread(tree)
     assert gathered(tree)["a"] is tree["a"]
-    np.testing.assert_array_equal(placed(np.arange(3.0), tree["a"].sharding), tree["a"])
-    np.testing.assert_array_equal(placed(np.arange(3.0), None), tree["a"])
+    put = jax.device_put(tree["a"], jax.devices()[0])
+    for sharding, is_bound in ((None, False), (put.sharding, True)):
+        found = placed(np.arange(3.0), sharding)
+        assert found.committed == is_bound
+        np.testing.assert_array_equal(found, tree["a"])
+
+
+def test_of_several_processes_one_writes(monkeypatch, tmp_path):
+    """Process 0 writes a file or the checkpoint of a fit, and raises what kept it from that; the others write nothing, and hear of it."""
+    monkeypatch.setattr(processes, "is_spread", lambda _: True)
+    monkeypatch.setattr(processes, "_together", lambda a: np.asarray(a)[None])
+    place = js.Checkpoint(tmp_path / "fit.npz", every=1)
+    for rank, is_there in ((1, False), (0, True)):
+        monkeypatch.setattr(jax, "process_index", lambda rank=rank: rank)
+        js.save(tmp_path / "a.npz", {"a": np.arange(3)})
+        js.fit(lambda k: (k - 1.0) ** 2, 2.0, js.Adam(0.1), 2, checkpoint=place)
+        assert (tmp_path / "a.npz").exists() == place.path.exists() == is_there
+
+    def fail(_):
+        raise FileNotFoundError("there is no such folder")
+
+    with pytest.raises(FileNotFoundError, match="no such folder"):
+        processes.write_by_one("a.npz", {}, fail)
+    monkeypatch.setattr(processes, "_together", lambda a: np.array([True, False]))
+    monkeypatch.setattr(jax, "process_index", lambda: 1)
+    with pytest.raises(OSError, match="a.npz was not written: process 0 could not, and says why"):
+        processes.write_by_one("a.npz", {}, fail)

@@ -6,11 +6,11 @@ Cloths of n x n nodes (structural, shear and bend springs), symplectic Euler, fl
 set of flags is in `XLA_FLAGS` of a process of its own; the processes take turns, one run each per round. About six minutes on two cores.
 
 Read, for every workload: `speed` is the time without flags over the time with them, the median of the rounds' pairs (above 1 the flags
-pay), with the lowest and the highest; the second row without flags says what the machine alone does. `compile_s` is the seconds to trace,
-lower and compile, and for the gradient `first_gradient_s` with its first run. `difference` is the largest difference of the result from
-that without flags, over its range (a gradient: over its largest entry); what float32 itself is off by stands in the benchmarks `explicit`
-and `gradient`. `tells_nan` says whether a run that blows up still has NONFINITE in its status. A set that the installed jaxlib does not
-know is left out, and its message printed.
+pay), with the lowest and the highest; the second row, a further run without flags, says what the machine alone does. `compile_s` is the
+seconds to trace, lower and compile, and for the gradient `first_gradient_s` with its first run. `difference` is the largest difference of
+the result from that without flags, over its range (a gradient: over its largest entry); what float32 itself is off by stands in the
+benchmarks `explicit` and `gradient`. `tells_nan` says whether a run that blows up still has NONFINITE in its status. A set that the
+installed jaxlib does not know is left out, and its message printed.
 """
 
 from __future__ import annotations
@@ -36,7 +36,6 @@ NONE, AGAIN = "no flags", "no flags, again"
 ROUNDING = "--xla_cpu_enable_fast_math=true"
 SETS: dict[str, str] = {
     NONE: "",
-    AGAIN: "",
     "vectors of 512 bits": "--xla_cpu_prefer_vector_width=512",
     "sums and products in any order": ROUNDING,
     "approximate functions": f"{ROUNDING} --xla_cpu_fast_math_honor_functions=false --xla_cpu_fast_math_honor_division=false",
@@ -141,7 +140,8 @@ class Worker:
 
 def compare(name: str, workers: dict[str, Worker], rounds: int) -> list[dict[str, Any]]:
     """One row per set of flags."""
-    first = {key: worker.ask(name) for key, worker in workers.items()}
+    first = {key: worker.ask(name) for key, worker in workers.items() if key != AGAIN}
+    first[AGAIN] = first[NONE]
     taken: dict[str, list[float]] = {key: [] for key in workers}
     for _ in range(rounds):
         for key, worker in workers.items():
@@ -181,10 +181,11 @@ def main() -> None:
     if given.serve is not None:
         serve(given.serve, given.quick)
         return
-    chosen = {name: flags for name, flags in SETS.items() if name in (NONE, AGAIN) or any(word in name for word in given.only or [""])}
+    chosen = {name: flags for name, flags in SETS.items() if name == NONE or any(word in name for word in given.only or [""])}
     names, rounds = [*list(CLOTHS)[: 3 if given.quick else 4], GRADIENT[0]], 3 if given.quick else 9
     tables: dict[str, list[dict[str, Any]]] = {}
     workers: dict[str, Worker] = {}
+    settings = {"rounds": rounds, "quick": given.quick, "sets": chosen}
     with tempfile.TemporaryDirectory() as folder:
         try:
             for number, (name, flags) in enumerate(chosen.items()):
@@ -192,15 +193,18 @@ def main() -> None:
                 if not workers[name].is_ready():
                     print(f"{name} ({flags}) is left out: {workers[name].last_words()}", flush=True)
                     workers.pop(name).close()
+                elif name == NONE:
+                    workers[AGAIN] = workers[NONE]
             for name in names:
                 tables[name] = compare(name, workers, rounds)
                 show(name, tables[name])
+                write("flags", settings, {"workloads": tables})  # what is done is kept where the rest is interrupted
             told = [{"flags": key, "tells_nan": worker.ask("tells nan")} for key, worker in workers.items()]
             show("a run that blows up", told)
         finally:
-            for worker in workers.values():
+            for worker in set(workers.values()):
                 worker.close()
-    path = write("flags", {"rounds": rounds, "quick": given.quick, "sets": chosen}, {"workloads": tables, "blown_up": told})
+    path = write("flags", settings, {"workloads": tables, "blown_up": told})
     draw([picture(tables)], path.with_suffix(".png"))
 
 

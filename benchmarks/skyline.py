@@ -147,7 +147,6 @@ def solve_once(case: Problem, rounds: int) -> dict[str, Any]:
 
 def reuse(case: Problem, rounds: int) -> dict[str, Any]:
     """A rollout of linear solves with a constant matrix: the factor kept in memory, or made in every step."""
-
     clock = Stopwatch()
 
     def run(is_kept: bool) -> Any:

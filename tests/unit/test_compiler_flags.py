@@ -14,9 +14,10 @@ PAGE = Path(__file__).resolve().parents[2] / "docs" / "scale.md"
 
 
 def documented():
-    """Name -> value of every flag in the section on flags."""
+    """Name -> value of every flag in the section on flags, as a compilation takes it."""
     section = PAGE.read_text(encoding="utf-8").split("## The compiler's flags")[1].split("\n## ")[0]
-    return dict(re.findall(r"--(xla_\w+)=(\w+)", section))
+    words = {"true": True, "false": False}
+    return {name: words.get(value, value) for name, value in re.findall(r"--(xla_\w+)=(\w+)", section)}
 
 
 @pytest.mark.slow

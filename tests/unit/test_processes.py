@@ -203,5 +203,5 @@ def test_of_several_processes_one_writes(monkeypatch, tmp_path):
         processes.write_by_one("a.npz", {}, fail)
     monkeypatch.setattr(processes, "_together", lambda a: np.array([True, False]))
     monkeypatch.setattr(jax, "process_index", lambda: 1)
-    with pytest.raises(OSError, match="a.npz was not written: process 0 could not, and says why"):
+    with pytest.raises(OSError, match=r"a\.npz was not written: process 0 could not, and says why"):
         processes.write_by_one("a.npz", {}, fail)

@@ -47,7 +47,8 @@ SETS: dict[str, str] = {
 }
 # Name -> (n, steps, steps of the quick look). A run takes a tenth of a second or two.
 CLOTHS = {"cloth 32": (32, 8000, 500), "cloth 128": (128, 800, 100), "cloth 512": (512, 60, 10), "cloth 1024": (1024, 12, 4)}
-GRADIENT = ("gradient 128", 128, 100, 20)
+GRADIENT = "gradient 128"
+SIZES = {**CLOTHS, GRADIENT: (128, 100, 20)}
 
 
 def serve(folder: Path, quick: bool) -> None:
@@ -75,22 +76,17 @@ def serve(folder: Path, quick: bool) -> None:
             jax.block_until_ready(program(*arguments))
             print(json.dumps(clock.seconds), flush=True)
             continue
-        n, n_steps = (GRADIENT[1], GRADIENT[3 if quick else 2]) if name == GRADIENT[0] else _size(name, quick)
-        make = scenes.gradient_program if name == GRADIENT[0] else scenes.program
-        function, arguments = make(*scenes.sheet(n), explicit.DT, n_steps)
+        n, n_steps, few = SIZES[name]
+        make = scenes.gradient_program if name == GRADIENT else scenes.program
+        function, arguments = make(*scenes.sheet(n), explicit.DT, few if quick else n_steps)
         clock = Stopwatch()
         program = function.lower(*arguments).compile()
         compile_s = clock.seconds
         found = jax.block_until_ready(program(*arguments))
         first_s = clock.seconds
         built[name] = program, arguments
-        np.savez(folder / f"{name}.npz", *map(np.asarray, found if name == GRADIENT[0] else [found.state.points]))
+        np.savez(folder / f"{name}.npz", *map(np.asarray, found if name == GRADIENT else [found.state.points]))
         print(json.dumps({"compile_s": compile_s, "first_s": first_s}), flush=True)
-
-
-def _size(name: str, quick: bool) -> tuple[int, int]:
-    n, n_steps, few = CLOTHS[name]
-    return n, few if quick else n_steps
 
 
 class Worker:
@@ -158,7 +154,7 @@ def compare(name: str, workers: dict[str, Worker], rounds: int) -> list[dict[str
             "high": float(speed.max()),
             "compile_s": first[key]["compile_s"],
         }
-        row |= {"first_gradient_s": first[key]["first_s"]} if name == GRADIENT[0] else {}
+        row |= {"first_gradient_s": first[key]["first_s"]} if name == GRADIENT else {}
         rows.append(row | {"difference": difference(workers[NONE].folder, worker.folder, name)})
     return rows
 
@@ -167,7 +163,7 @@ def difference(base: Path, other: Path, name: str) -> float:
     """Largest difference of what two processes computed, over the range of the first."""
     with np.load(base / f"{name}.npz") as expected, np.load(other / f"{name}.npz") as found:
         pairs = [(expected[key].astype(float), found[key].astype(float)) for key in expected.files]
-    size = [np.abs(a).max() if name == GRADIENT[0] else np.ptp(a, axis=0).max() for a, _ in pairs]
+    size = [np.abs(a).max() if name == GRADIENT else np.ptp(a, axis=0).max() for a, _ in pairs]
     return float(max(np.abs(a - b).max() / s for (a, b), s in zip(pairs, size, strict=True)))
 
 
@@ -182,7 +178,7 @@ def main() -> None:
         serve(given.serve, given.quick)
         return
     chosen = {name: flags for name, flags in SETS.items() if name == NONE or any(word in name for word in given.only or [""])}
-    names, rounds = [*list(CLOTHS)[: 3 if given.quick else 4], GRADIENT[0]], 3 if given.quick else 9
+    names, rounds = [*list(CLOTHS)[: 3 if given.quick else 4], GRADIENT], 3 if given.quick else 9
     tables: dict[str, list[dict[str, Any]]] = {}
     workers: dict[str, Worker] = {}
     settings = {"rounds": rounds, "quick": given.quick, "sets": chosen}

@@ -13,7 +13,7 @@ import equinox as eqx
 import numpy as np
 
 from .numerics import is_traced
-from .processes import is_spread
+from .processes import is_readable
 
 _INDENT = "  "
 
@@ -26,7 +26,7 @@ def numbers(values: Any) -> str:
     """
     if is_traced(values):
         return f"{values.dtype}{list(values.shape)}, traced"
-    if is_spread(values):
+    if not is_readable(values):
         return f"{values.dtype}{list(values.shape)} in several processes"
     if not isinstance(getattr(values, "dtype", np.dtype(float)), np.dtype):
         return str(values.dtype)  # keys of random numbers

@@ -27,6 +27,11 @@ def is_spread(tree: PyTree) -> bool:
     return any(map(_is_spread, jax.tree.leaves(tree)))
 
 
+def is_readable(tree: PyTree) -> bool:
+    """Whether this process can read every array of a tree by itself: what each process holds whole is read by each."""
+    return not any(_is_spread(leaf) and not leaf.is_fully_replicated for leaf in jax.tree.leaves(tree))
+
+
 def spread(tree: PyTree, sharding: Sharding) -> PyTree:
     """The arrays of a tree laid out over a mesh; where that is one of several processes, each must have the same arrays.
 
@@ -55,7 +60,13 @@ def gathered(tree: PyTree) -> PyTree:
     Raises:
         ConnectionError: another process has ended.
     """
-    return jax.tree.map(lambda a: _together(a) if _is_spread(a) else a, tree)
+
+    def one(a: Any) -> Any:
+        if is_readable(a):
+            return np.asarray(a) if _is_spread(a) else a
+        return _together(a)
+
+    return jax.tree.map(one, tree)
 
 
 def write_by_one(path: str | os.PathLike[str], tree: PyTree, write: Callable[[PyTree], None]) -> None:
@@ -101,4 +112,4 @@ def _together(a: Any) -> np.ndarray:
         ) from error
 
 
-__all__ = ["gathered", "is_spread", "placed", "spread", "write_by_one"]
+__all__ = ["gathered", "is_readable", "is_spread", "placed", "spread", "write_by_one"]

@@ -18,7 +18,7 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Int, UInt32
 
-from .processes import gathered, is_spread
+from .processes import gathered, is_readable
 
 
 class Flag(enum.IntFlag):
@@ -165,7 +165,7 @@ class Status(eqx.Module):
 
         Not for traced values.
         """
-        if is_spread(self):
+        if not is_readable(self):
             return "of scenes in several processes: call raise_for_status in all of them"
         flags = np.asarray(self.flags)
         errors, warned = (flags & int(~WARNINGS & 0xFFFFFFFF)) != 0, (flags & int(WARNINGS)) != 0

@@ -7,7 +7,8 @@ Three processes hold the same workloads: this checkout, this checkout once more,
 round. Read: `ratio` is the time of this checkout over the other's, the median of the rounds' pairs, with the lowest and the highest;
 `itself` is the same for this checkout against itself, so that its spread says what the machine alone does. A workload counts as slower
 where its median is above 1.03 and above the spread of `itself`; then the exit code is 1. `compile` is the same ratio of the seconds to
-trace, compile and run once, of as many first runs as `--first` says, each after all programs were dropped.
+trace, compile and run once (`compile_s`; of a gradient `first_gradient_s`), of as many first runs as `--first` says, each after all
+programs were dropped.
 """
 
 from __future__ import annotations
@@ -139,9 +140,10 @@ def compare(names: list[str], other: Path, rounds: int, n_first: int) -> list[di
             "itself": float(np.median(itself)),
             "itself_low": float(itself.min()),
             "itself_high": float(itself.max()),
-            "compile_s": float(np.median(first[:, 1])),
             "compile": float(np.median(first[:, 1] / first[:, 0])),
             "compile_itself": float(np.median(first[:, 2] / first[:, 1])),
+            "compile_s": None if name.startswith("gradient") else float(np.median(first[:, 1])),
+            "first_gradient_s": float(np.median(first[:, 1])) if name.startswith("gradient") else None,
         }
         row["slower"] = bool(row["ratio"] > max(SLOWER, row["itself_high"], 1 / row["itself_low"]))
         rows.append(row)

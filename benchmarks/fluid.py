@@ -5,7 +5,8 @@
 Lennard-Jones, its force shifted to zero at 2.5 sigma, skin 0.3, liquid density 0.8, float32, 1e3 to 1e5 particles in open space. Beside it,
 where they are installed: jax-md, Warp's hash grid, a list in numba. Read: `M` is million pairs within the cut-off a second, each counted
 once, the median of interleaved rounds, each a burst of at least 20 ms; `error` is the largest difference from the float64 sum over all
-pairs, over the largest force. `gradient` is that of the squared forces by the positions, in forces.
+pairs, over the largest force. `gradient` is that of the squared forces by the positions, in forces. `compile_s` is the first run, in
+which others compile as well.
 In full steps (100 of velocity Verlet, speeds of temperature 1) the list is remade when it must be, Warp's grid in each; `apart` is how far
 the points end from ours, in sigma; the pairs are those at the start. Draws rates and steps.
 """
@@ -92,17 +93,18 @@ def costs(points: np.ndarray, speeds: np.ndarray, rounds: int) -> dict[str, floa
     force, gradient = jax.jit(lambda s: system.force(s)), jax.jit(lambda s: jax.grad(squared_forces)(s.position))
     begin = jax.jit(lambda s: system.begin(dataclasses.replace(s, memory=None)))
     runs = {"force": lambda: force(state), "list": lambda: begin(state), "gradient": lambda: gradient(state)}
-    taken = seconds(runs, rounds)
-    return {name: taken[name] / taken["force"] for name in ("list", "gradient")}
+    taken, first = seconds(runs, rounds)
+    return {**{name: taken[name] / taken["force"] for name in ("list", "gradient")}, "first_gradient_s": first["gradient"]}
 
 
-def seconds(runs: dict[str, Callable[[], Any]], rounds: int) -> dict[str, float]:
-    """Median time of each, in interleaved rounds of bursts: a simulation asks again at once."""
+def seconds(runs: dict[str, Callable[[], Any]], rounds: int) -> tuple[dict[str, float], dict[str, float]]:
+    """Median time of each, in interleaved rounds of bursts: a simulation asks again at once; and that of the first run of each."""
     times: dict[str, list[float]] = {name: [] for name in runs}
-    counts = {}
+    counts, first = {}, {}
     for name, run in runs.items():
-        jax.block_until_ready(run())
         clock = Stopwatch()
+        jax.block_until_ready(run())
+        first[name], clock = clock.seconds, Stopwatch()
         jax.block_until_ready(run())
         counts[name] = max(1, round(BURST_S / max(clock.seconds, 1e-9)))
     for _ in range(rounds):
@@ -111,7 +113,7 @@ def seconds(runs: dict[str, Callable[[], Any]], rounds: int) -> dict[str, float]
             for _ in range(counts[name]):
                 jax.block_until_ready(run())
             times[name].append(clock.seconds / counts[name])
-    return {name: statistics.median(taken) for name, taken in times.items()}
+    return {name: statistics.median(taken) for name, taken in times.items()}, first
 
 
 def one_size(n: int, rounds: int) -> tuple[list[dict], list[dict], dict]:
@@ -120,20 +122,24 @@ def one_size(n: int, rounds: int) -> tuple[list[dict], list[dict], dict]:
     reference, n_pairs = exact(points)
     peers = {name: getattr(fluid_peers, name)(points, speeds, REACH, SKIN) for name in ("jax_md", "warp", "numba")}
     programs = {"jaxspring": ours(points, speeds), **{name: peer for name, peer in peers.items() if peer is not None}}
-    taken = seconds({name: peer.force for name, peer in programs.items()}, rounds)
+    taken, first = seconds({name: peer.force for name, peer in programs.items()}, rounds)
     forces = []
     for name, peer in programs.items():
         error = float(np.abs(peer.forces() - reference).max() / np.abs(reference).max())
-        forces.append({"n": n, "program": name, "ms": taken[name] * 1e3, "M": n_pairs / taken[name] / 1e6, "error": error})
+        row = {"n": n, "program": name, "ms": taken[name] * 1e3, "M": n_pairs / taken[name] / 1e6, "error": error}
+        forces.append(row | {"compile_s": first[name]})
 
     runs = {name: peer.steps(DT, N_STEPS) for name, peer in programs.items()}
-    ends = {name: run() for name, run in runs.items()}
-    taken = seconds(runs, max(rounds // 3, 3))
-    steps = []
-    for name, (end, rebuilds) in ends.items():
+    ends, steps = {}, []
+    for name, run in runs.items():
+        clock = Stopwatch()
+        ends[name] = (*run(), clock.seconds)
+    taken, _ = seconds(runs, max(rounds // 3, 3))
+    for name, (end, rebuilds, compile_s) in ends.items():
         each = taken[name] / N_STEPS
         apart = float(np.abs(end - ends["jaxspring"][0]).max())
-        steps.append({"n": n, "program": name, "ms": each * 1e3, "M": n_pairs / each / 1e6, "rebuilds": rebuilds, "apart": apart})
+        row = {"n": n, "program": name, "ms": each * 1e3, "M": n_pairs / each / 1e6, "rebuilds": rebuilds, "apart": apart}
+        steps.append(row | {"compile_s": compile_s})
     return forces, steps, {"n": n, **costs(points, speeds, rounds)}
 
 

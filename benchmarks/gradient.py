@@ -16,6 +16,7 @@ import jax
 import numpy as np
 
 import jaxspring as js
+from jaxspring.progress import Stopwatch
 
 from . import scenes
 from .measure import Case, Panel, arguments, draw, measure, show, write
@@ -59,6 +60,7 @@ def graphs(sizes: list[tuple[int, int]], rounds: int) -> list[dict]:
                 "autodiff_over_bare": seconds["autodiff"] / seconds["bare"],
                 "over_autodiff": seconds["gradient"] / seconds["autodiff"],
                 "compile_s": timed["gradient"].compile_s,
+                "first_gradient_s": timed["gradient"].first_s,
                 "temporary_mib": timed["gradient"].temporary_mib,
                 "autodiff_mib": timed["autodiff"].temporary_mib,
                 "error": error(system, state),
@@ -74,8 +76,10 @@ def memory() -> list[dict]:
         system, state = _in_float64(*scenes.sheet(10))
         for n_steps, observe in ((1_000, False), (10_000, False), (10_007, False), (10_000, True)):
             function, arrays = scenes.gradient_program(system, state, 0.01, n_steps, observe)
-            mib = function.lower(*arrays).compile().memory_analysis().temp_size_in_bytes / 2**20
-            rows.append({"nodes": 100, "steps": n_steps, "observe": observe, "temporary_mib": mib})
+            clock = Stopwatch()
+            program = function.lower(*arrays).compile()
+            mib = program.memory_analysis().temp_size_in_bytes / 2**20
+            rows.append({"nodes": 100, "steps": n_steps, "observe": observe, "compile_s": clock.seconds, "temporary_mib": mib})
     return rows
 
 
@@ -123,6 +127,7 @@ def _row(timed: dict, base: str) -> dict:
         "low_s": gradient.low_s,
         "high_s": gradient.high_s,
         "compile_s": gradient.compile_s,
+        "first_gradient_s": gradient.first_s,
         "temporary_mib": gradient.temporary_mib,
     }
 

@@ -76,6 +76,7 @@ def main() -> None:
                     "backward": None if name == "forward" else row.run_s / base.run_s - 1,
                     "temporary_mib": row.temporary_mib,
                     "compile_s": row.compile_s,
+                    "first_gradient_s": None if name == "forward" else row.first_s,
                     "agreement": None if differs is None else float(differs),
                 }
             )

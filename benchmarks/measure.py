@@ -35,10 +35,20 @@ class Case:
 
 @dataclass
 class Row:
-    """What was measured of a case."""
+    """What was measured of a case.
+
+    Attributes:
+        name: of the case.
+        compile_s: seconds to trace, lower and compile.
+        first_s: the same with the first run; of a gradient, the seconds until the first one is there.
+        run_s, low_s, high_s: seconds of a run, median and 10 and 90 %.
+        temporary_mib: temporary memory.
+        error: against a reference.
+    """
 
     name: str
     compile_s: float
+    first_s: float
     run_s: float
     low_s: float
     high_s: float
@@ -55,8 +65,9 @@ def measure(cases: list[Case], rounds: int = 9) -> dict[str, Row]:
         seconds = clock.seconds
         memory = program.memory_analysis()
         compiled[case.name] = program
-        rows[case.name] = Row(case.name, seconds, 0.0, 0.0, 0.0, memory.temp_size_in_bytes / 2**20)
+        clock = Stopwatch()
         jax.block_until_ready(program(*case.arguments))
+        rows[case.name] = Row(case.name, seconds, seconds + clock.seconds, 0.0, 0.0, 0.0, memory.temp_size_in_bytes / 2**20)
     for _ in range(rounds):
         for case in cases:
             times[case.name].append(_seconds(partial(compiled[case.name], *case.arguments)))

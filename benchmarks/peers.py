@@ -15,8 +15,8 @@ fastest in three runs take part, and of these the one with the lower median stan
 Read: `M` is million node-steps (points, pairs) a second, the median of the rounds, with `low` and `high` of the seconds (10 and 90 %).
 `ratio` is jaxspring's time over the contender's, the median of the rounds' pairs: above 1, the contender is faster. `error` is the largest
 difference from float64 NumPy after 20 steps, over the range of the result (gradients: over the largest entry). compile_s is all that
-comes between imports and the second run: tables, compilation, first run. peak_mib is the process's largest resident memory, built_mib
-what of it came after its imports.
+comes between imports and the second run: tables, compilation, first run; for a gradient it is called first_gradient_s. peak_mib is the
+process's largest resident memory, built_mib what of it came after its imports.
 
 Left out: MuJoCo, whose flexible bodies take no stiffness for each spring and move each node as a rigid body with three joints; PyTorch and
 jax-md for springs, which have no compiled loop over steps or none of springs that is meant to be fast on a CPU.

@@ -139,7 +139,7 @@ def rows_of(scene: Scene, method: Method, expected: tuple[np.ndarray, float], ha
     """One row per setting."""
     constant, clock = jnp.asarray(scene.value), Stopwatch()
     run = jax.jit(method.run).lower(constant, method.settings[0][1]).compile()
-    compile_s, slope, rows = clock.seconds, None, []
+    compile_s, slope, first_gradient_s, rows = clock.seconds, None, None, []
     start = points(scene, scene.start.position)
     displacement = np.sqrt(np.mean((expected[0] - start) ** 2))
     for text, setting in method.settings:
@@ -152,11 +152,16 @@ def rows_of(scene: Scene, method: Method, expected: tuple[np.ndarray, float], ha
         row = {"method": method.name, "setting": text, "steps": int(steps), "run_s": run_s, "error": error}
         gradient_s = gradient_error = None
         if has_gradient and not is_unstable and run_s < LONG:
+            first = Stopwatch()
             slope = slope or jax.jit(differentiated(scene, method.run)).lower(constant, setting).compile()
+            if first_gradient_s is None:
+                jax.block_until_ready(slope(constant, setting))
+                first_gradient_s = first.seconds
             (derivative, _), gradient_s = timed(slope, constant, setting, 1)
             gradient_error = abs(float(derivative) / expected[1] - 1)
         row |= {"gradient_s": gradient_s, "gradient_error": gradient_error, "status": str(js.Flag(int(flags)).name or "OK")}
-        rows.append(row | {"unstable": "UNSTABLE" if is_unstable else "", "compile_s": compile_s})
+        row |= {"compile_s": compile_s, "first_gradient_s": first_gradient_s}
+        rows.append(row | {"unstable": "UNSTABLE" if is_unstable else ""})
     print(f"{scene.name:6s} {method.name:22s} {clock.seconds:6.1f} s, compile {compile_s:.1f} s", flush=True)
     return rows
 

@@ -19,6 +19,7 @@ from jax import lax
 from jax.sharding import Mesh
 
 from ._arrays import own, whole_number
+from .processes import spread
 from .sharing import shardings
 
 CACHE = 2**18  # bytes of arguments in a chunk: with what a step adds to them they fit the second-level cache of one core
@@ -34,7 +35,8 @@ def batch(function: Callable[..., Any], in_axes: Any = 0, *, chunk: int | None =
         chunk: scenes that are computed together; None takes what fits the cache. The memory of a run, and of its gradient, is that of a
             chunk beside arguments and results.
         mesh: devices that share the batch, each computing its own scenes; None computes where the arguments are. No device sees another's
-            scenes. The number of scenes must be a multiple of that of the devices.
+            scenes. The number of scenes must be a multiple of that of the devices. Where these are of several processes, all call the
+            function with the same arguments, and each holds the results of its own scenes.
 
     Returns:
         The function of batches; every array that it gives has the scenes on its first axis.
@@ -125,7 +127,7 @@ def _on_devices(of_one: Callable[..., Any], shared: list[Any], mapped: list[Any]
 
     scenes, whole = shardings(mesh)
     of_all = jax.shard_map(of_device, mesh=scenes.mesh, in_specs=(whole.spec, scenes.spec), out_specs=scenes.spec, check_vma=False)
-    return of_all(jax.device_put(shared, whole), jax.device_put(mapped, scenes))
+    return of_all(spread(shared, whole), spread(mapped, scenes))
 
 
 def _in_chunks(of_one: Callable[..., Any], shared: list[Any], mapped: list[Any], size: int, chunk: int | None) -> Any:

@@ -19,6 +19,7 @@ import numpy as np
 from .archive import CheckpointError, Path, read_archive, write_archive
 from .memory import Memory, without_caches
 from .numbering import inward, outward
+from .processes import placed, write_by_one
 from .state import State
 from .topology.base import Topology
 from .topology.edge_field import EdgeField
@@ -36,10 +37,13 @@ def save(path: Path, tree: PyTree) -> None:
             it is, which on a graph is the graph's own order: save `net.flatten_nodes(a)` of it instead. Leaves that are no
             arrays or numbers (functions) are not stored: `load` takes them from `like`.
 
+    However many devices hold an array, one whole array is stored. Where its devices are of several processes, all of these call `save`:
+    process 0 writes, and none returns before the file is there.
+
     Raises:
         TypeError: a leaf holds something other than real or complex numbers or booleans; half precision that NumPy lacks.
         ValueError: a name in the tree cannot be stored ('../x').
-        OSError: the disk is full; the file that was there is still there.
+        OSError: the disk is full; the file that was there is still there. Another process has ended (`ConnectionError`).
 
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
@@ -49,7 +53,7 @@ def save(path: Path, tree: PyTree) -> None:
     """
     tree = without_caches(tree)
     about = {"kind": "tree", "form": FORM, "topologies": topologies(tree), "edge_fields": edge_fields(tree), "owners": owners(tree)}
-    write_archive(path, named_arrays(tree), about)
+    write_by_one(path, tree, lambda whole: write_archive(path, named_arrays(whole), about))
 
 
 def load(path: Path, like: PyTree = None) -> PyTree:
@@ -61,7 +65,8 @@ def load(path: Path, like: PyTree = None) -> PyTree:
             None returns a plain dictionary, name -> NumPy array.
 
     Returns:
-        A tree as `like`, with the numbers of the file.
+        A tree as `like`, with the numbers of the file, each array on the devices of that in `like`; which devices it was saved from does
+        not matter.
 
     Raises:
         CheckpointError: the file is damaged or of another version, or does not fit `like`; both sides are named.
@@ -140,7 +145,7 @@ def restored(path: Path, arrays: Mapping[str, np.ndarray], like: PyTree, form: i
         hint = ". For a state that remembers something pass like=system.begin(state), by which every part has its memory" * is_memory
         complain(path, f"it lacks {missing[:5]} and has {unknown[:5]} that `like` does not know; expected {sorted(wanted)[:8]}{hint}")
     found = treedef.unflatten([_fitted(path, leaf_name(p), arrays, leaf) for p, leaf in leaves])
-    return found if form < FORM else inward(found)
+    return jax.tree.map(_placed, found if form < FORM else inward(found), like)
 
 
 def _of_form_1(path: Path, arrays: Mapping[str, np.ndarray], like: PyTree) -> Mapping[str, np.ndarray]:
@@ -223,15 +228,21 @@ def _is_stored(leaf: Any) -> bool:
 
 
 def _fitted(path: Path, name: str, arrays: Mapping[str, np.ndarray], leaf: Any) -> Any:
-    """The stored array as `leaf` is: a JAX array, a NumPy array or a number."""
+    """The stored array where `leaf` is one, a number where it is a number."""
     if not _is_stored(leaf):
         return leaf
     array = arrays[name]
     shape, dtype = (leaf.shape, np.dtype(leaf.dtype)) if hasattr(leaf, "dtype") else ((), np.asarray(leaf).dtype)
     if tuple(array.shape) != tuple(shape) or array.dtype != dtype:
         complain(path, f"{name!r} has shape {array.shape} and dtype {array.dtype}; expected shape {tuple(shape)} and dtype {dtype}")
-    if isinstance(leaf, np.ndarray):
+    if isinstance(leaf, np.ndarray | jax.Array | jax.ShapeDtypeStruct):
         return array
-    if isinstance(leaf, jax.Array | jax.ShapeDtypeStruct):
-        return jnp.asarray(array)
     return array[()] if isinstance(leaf, np.generic) else array.item()
+
+
+def _placed(array: Any, leaf: Any) -> Any:
+    """The array of JAX on the devices of `leaf`, where that is one; what was put nowhere is put nowhere."""
+    if not isinstance(leaf, jax.Array | jax.ShapeDtypeStruct):
+        return array
+    is_bound = isinstance(leaf, jax.ShapeDtypeStruct) or getattr(leaf, "committed", False)
+    return placed(array, leaf.sharding if is_bound else None)

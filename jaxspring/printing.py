@@ -13,6 +13,7 @@ import equinox as eqx
 import numpy as np
 
 from .numerics import is_traced
+from .processes import is_readable
 
 _INDENT = "  "
 
@@ -25,6 +26,8 @@ def numbers(values: Any) -> str:
     """
     if is_traced(values):
         return f"{values.dtype}{list(values.shape)}, traced"
+    if not is_readable(values):
+        return f"{values.dtype}{list(values.shape)} in several processes"
     if not isinstance(getattr(values, "dtype", np.dtype(float)), np.dtype):
         return str(values.dtype)  # keys of random numbers
     array = np.asarray(values)

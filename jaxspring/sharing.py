@@ -9,6 +9,7 @@ from __future__ import annotations
 import jax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from .processes import spread
 from .state import State
 
 
@@ -17,7 +18,7 @@ def domain(state: State, mesh: Mesh) -> State:
 
     Args:
         state: of a lattice; rows are its first axis: the slowest, that of ny in (ny, nx).
-        mesh: the devices. Their number must divide that of the rows.
+        mesh: the devices, of this process or of several. Their number must divide that of the rows.
 
     Returns:
         The same state. Time, and what is of no node, is on every device.
@@ -41,7 +42,7 @@ def domain(state: State, mesh: Mesh) -> State:
     if shape[0] % mesh.size:
         raise ValueError(f"the lattice has {shape[0]} rows, which {mesh.size} devices cannot share; expected a multiple of {mesh.size}.")
     rows, whole = shardings(mesh)
-    return jax.tree.map(lambda a: jax.device_put(a, rows if a.shape == shape else whole), state)
+    return jax.tree.map(lambda a: spread(a, rows if a.shape == shape else whole), state)
 
 
 def shardings(mesh: Mesh) -> tuple[NamedSharding, NamedSharding]:

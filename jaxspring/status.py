@@ -18,6 +18,8 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Int, UInt32
 
+from .processes import gathered, is_readable
+
 
 class Flag(enum.IntFlag):
     """Kinds of trouble. Those in `WARNINGS` leave a usable result; the others do not."""
@@ -163,6 +165,8 @@ class Status(eqx.Module):
 
         Not for traced values.
         """
+        if not is_readable(self):
+            return "of scenes in several processes: call raise_for_status in all of them"
         flags = np.asarray(self.flags)
         errors, warned = (flags & int(~WARNINGS & 0xFFFFFFFF)) != 0, (flags & int(WARNINGS)) != 0
         if not np.any(flags):
@@ -213,7 +217,7 @@ class HasStatus(Protocol):
 def raise_for_status(result: Status | HasStatus) -> None:
     """Raise `SimulationError` where `result` (or a `Status`) holds an error; warn where it holds a warning only.
 
-    Inside `jit` a status is a traced value: return it and call this outside.
+    Inside `jit` a status is a traced value: return it and call this outside. Where scenes are in several processes, call it in all.
 
     Args:
         result: what a public function returned, or the status itself.
@@ -225,9 +229,9 @@ def raise_for_status(result: Status | HasStatus) -> None:
     status = result if isinstance(result, Status) else result.status
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(status)):
         raise TypeError("raise_for_status was called on a traced status. Return the result from jit, and call it outside.")
-    note = getattr(result, "effects", ())
+    status, note = gathered(status), getattr(result, "effects", ())
     if not bool(np.all(np.asarray(status.is_ok))):
-        hint = getattr(getattr(result, "info", None), "stable_dt", None)
+        hint = gathered(getattr(getattr(result, "info", None), "stable_dt", None))
         # Of the lane that the text names.
         failed = np.argwhere(~np.asarray(status.is_ok))[0]
         least = np.inf if hint is None else float(np.broadcast_to(np.asarray(hint), np.shape(status.flags))[tuple(failed)])

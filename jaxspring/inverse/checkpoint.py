@@ -5,10 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import equinox as eqx
+import jax
 import numpy as np
 
 from ..archive import Path, read_archive, remove_leftovers, write_archive
 from ..files import FORM, complain, expect_same, named_arrays, restored, topologies
+from ..processes import write_by_one
 
 PyTree = Any
 PARTS = ("parameters", "best", "memory", "carried", "best_carried")
@@ -65,12 +67,17 @@ def write_checkpoint(place: Checkpoint, snapshot: Snapshot, identity: dict[str, 
         snapshot: what the iteration after it starts from.
         identity: what the numbers mean nothing without: the transforms ("coordinates") and the settings of the optimiser.
     """
-    arrays = {f"history/{name}": np.asarray(snapshot.history[name][: snapshot.iteration], np.float64) for name in HISTORY}
-    for part in PARTS:
-        arrays |= {f"{part}/{name}": array for name, array in named_arrays(getattr(snapshot, part)).items()}
-    arrays["next/loss"] = np.asarray(snapshot.history["loss"][snapshot.iteration], np.float64)
     about = {"kind": "fit", "form": FORM, "note": place.note, "best_iteration": snapshot.best_iteration} | identity
-    write_archive(place.path, arrays, about | {"topologies": topologies(snapshot.parameters)})
+    about |= {"topologies": topologies(snapshot.parameters)}
+
+    def write(parts: dict[str, PyTree]) -> None:
+        arrays = {f"history/{name}": np.asarray(snapshot.history[name][: snapshot.iteration], np.float64) for name in HISTORY}
+        for part, tree in parts.items():
+            arrays |= {f"{part}/{name}": array for name, array in named_arrays(tree).items()}
+        arrays["next/loss"] = np.asarray(snapshot.history["loss"][snapshot.iteration], np.float64)
+        write_archive(place.path, arrays, about)
+
+    write_by_one(place.path, {part: getattr(snapshot, part) for part in PARTS}, write)
 
 
 def read_checkpoint(place: Checkpoint, like: Snapshot, identity: dict[str, Any]) -> tuple[Snapshot, float]:
@@ -81,7 +88,8 @@ def read_checkpoint(place: Checkpoint, like: Snapshot, identity: dict[str, Any])
         OSError: there is no such file.
     """
     path = place.path
-    remove_leftovers(path)
+    if jax.process_index() == 0:  # of several, the one that writes
+        remove_leftovers(path)
     archive = read_archive(path)
     expect_same(path, "kind", archive.about.get("kind"), "fit")
     expect_same(path, "problem", archive.about.get("note"), place.note)

@@ -20,6 +20,7 @@ LAYERS = {
     "vector": 0,
     "archive": 0,  # files of arrays, whole or not at all
     "pickling": 0,
+    "processes": 0,  # arrays that several processes hold together
     "topology": 1,
     "images": 1,
     "memory": 1,

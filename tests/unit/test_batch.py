@@ -157,6 +157,11 @@ DEVICES = """
     np.testing.assert_array_equal(js.batch(scene, chunk=2, mesh=made)(*elsewhere).state.points, one(*inputs).state.points)
     found = two(*inputs).state.points
     assert len(found.sharding.device_set) == 2
+    js.save(sys.argv[1], two(*inputs))
+    for like in (one(*inputs), two(*inputs)):
+        read = js.load(sys.argv[1], like=like)
+        assert read.state.position.x.sharding.device_set == like.state.position.x.sharding.device_set
+        jax.tree.map(np.testing.assert_array_equal, read, like)
 
     def loss(map_of, k):
         return jnp.mean(map_of(inputs[0], k, inputs[2]).state.points ** 2)
@@ -181,13 +186,15 @@ DEVICES = """
 """
 
 
-def test_two_devices_give_the_bits_of_one():
+def test_two_devices_give_the_bits_of_one(tmp_path):
     """Each scene's state and status are bitwise those of one device; no array of states travels, in a value or a gradient; a batch that a
-    user has sharded stays where it is under `jax.vmap` in the user's own `jit`.
+    user has sharded stays where it is under `jax.vmap` in the user's own `jit`; a file of it is read on one device or two.
     """
     environment = {**os.environ, "XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_ENABLE_X64": "1"}
     program = textwrap.dedent(DEVICES.format(root=str(ROOT)))
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=environment, check=False, cwd=ROOT)
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(tmp_path / "two.npz")], capture_output=True, text=True, env=environment, check=False, cwd=ROOT
+    )
     assert done.stdout == "done\n", done.stderr[-3000:]
 
 

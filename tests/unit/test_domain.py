@@ -58,14 +58,28 @@ PROGRAM = """
             assert "f64" not in re.findall(r" = (\\w+)\\[\\S* all-gather\\(", inside)
             halo[body] = sum(8 * math.prod(int(a) for a in row.split(",")) for row in rows)
     assert halo and max(halo.values()) <= 90 * n * 8, halo  # bytes that a device sends in a step: rows
+
+    # One whole array is saved, whoever holds it, and read on the devices of `like`.
+    one_file, two_file = sys.argv[1] + "/one.npz", sys.argv[1] + "/two.npz"
+    js.save(one_file, one)
+    js.save(two_file, two)
+    assert open(one_file, "rb").read() == open(two_file, "rb").read()
+    ended = by_two.state, by_two.resume
+    js.save(two_file, ended)
+    for like, n_devices in ((ended, 2), ((by_one.state, by_one.resume), 1)):
+        read = js.load(two_file, like=like)
+        assert len(read[0].position.x.sharding.device_set) == n_devices
+        jax.tree.map(np.testing.assert_array_equal, read, ended)
     print("done")
 """
 
 
-def test_two_devices_compute_what_one_does():
-    """State and gradient to rounding after 100 steps with held nodes, dashpots and weight; in a step rows alone cross the border."""
+def test_two_devices_compute_what_one_does(tmp_path):
+    """State and gradient to rounding after 100 steps with held nodes, dashpots and weight; in a step rows alone cross the border. A file
+    of the shared state is that of the whole, and is read on one device or two, bit for bit.
+    """
     environment = {**os.environ, "XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_ENABLE_X64": "1"}
-    command = [sys.executable, "-c", textwrap.dedent(PROGRAM)]
+    command = [sys.executable, "-c", textwrap.dedent(PROGRAM), str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False, cwd=ROOT)
     assert done.stdout == "done\n", done.stderr[-3000:]
 

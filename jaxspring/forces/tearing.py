@@ -5,7 +5,7 @@
                    stiffness (1 - t^2 (3 - 2 t)) k  breaks where t = 1
 
 Once a step, after the step has converged. Only stretched springs tear. The pull z is that of the spring whose stiffness is whole, which
-grows with its stretch. Breaking is a decision, of derivative zero; over the band, stiffness has a derivative by z_t, band and whatever moves
+grows with its stretch. Breaking is a decision, of derivative zero; over the band stiffness has a derivative by z_t, band and whatever moves
 the spring, and as the band shrinks the runs tend to those that break at once. What is lost never comes back.
 
 Source: continuum damage, Kachanov (1958) for the share of a section that still carries, Simo and Ju (1987) for damage that follows the
@@ -99,14 +99,16 @@ class Tearing(Breaking):
             off = map_living(self.net, state, lambda z, most: z > most, load, limit)
         else:
             worst = self.net.map_springs(lambda w, z: jnp.where(z > w, z, w), worst, load)
-            fallen = self.net.map_springs(lambda w, most, band: jnp.clip((w - most) / band, 0, 1), worst, limit, self.constant("band", state))
+            fallen = self.net.map_springs(
+                lambda w, most, band: jnp.clip((w - most) / band, 0, 1), worst, limit, self.constant("band", state)
+            )
             share = fallen.map(lambda t: 1 - t * t * (3 - 2 * t))
             off = map_living(self.net, state, lambda t: t >= 1, fallen)
         new = Torn(begun(self.net, memory.since, off, state.time), worst, share)
         return self.keep(state.with_alive(self.net, self.whole(state, off)), new), Status.ok()
 
     def load(self, state: State) -> EdgeField:
-        """What is held against the limit: strain without plastic stretch taken off, or pull [N] at the whole stiffness; zero where broken."""
+        """What the limit is compared with: the whole strain, or the pull at the whole stiffness [N]; zero where broken."""
         springs = self.known_springs()
         if self.strain is None:
             # Without what this rule has taken of the stiffness.

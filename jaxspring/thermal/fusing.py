@@ -18,7 +18,6 @@ from jaxtyping import Array
 from .._arrays import Numbers
 from .._checks import as_inexact, finite, has_shape, nonnegative, positive
 from ..forces.base import Scene, Step
-from ..forces.living import living
 from ..forces.molten import Molten, check_springs
 from ..forces.spring_rules import Breaking
 from ..numerics import cast_inexact

@@ -484,6 +484,7 @@ def instances():
         "",
     )
     pixels = js.reconstruction.PixelSprings(None, 1.0)
+    field = TWO.edge_field(jnp.ones(1))
     classes = [
         js.thermal.Account(number, number, number, number, number, number),
         *(js.Adam(), js.LBFGS(), js.LeastSquares(), js.inverse.Optax(optax.identity()), js.Stop()),
@@ -614,6 +615,12 @@ def instances():
             js.inverse.GradientCheck((), 1.0, status),
         ),
         js.inverse.Undetermined(1, {"k": whole}, None, ("k",)),
+        *(
+            js.plasticity.Yielding(TWO, 1.0, hardening=0.5),
+            js.plasticity.Tearing(TWO, strain=0.5),
+            js.plasticity.Onset(whole, whole, number),
+        ),
+        *(js.plasticity.Yielded(field, field, field), js.plasticity.Torn(field, None, None)),
     ]
     return {type(a).__name__: a for a in classes}
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 from typing import Any, TypeVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -100,6 +101,13 @@ def remembered(net: Topology, state: State, kind: type[Kind]) -> list[Kind]:
     return [entry.value for entry in entries if entry.owner.net == net.identity]
 
 
+def of_springs(state: State) -> list[Array]:
+    """Whatever of a state rules change for good and springs read: which hold, rest lengths, plastic stretch, shares of the stiffness."""
+    values = [entry.value for entry in state.memory or () if entry is not None]
+    read = [v.stretch if isinstance(v, Yielded) else v.share for v in values if isinstance(v, Yielded | Torn)]
+    return jax.tree.leaves((state.alive, state.rest_length, read))
+
+
 def never(net: Topology, state: State) -> EdgeField:
     """The time of what has not begun, for each spring [s]."""
     return net.everywhere(jnp.full((), jnp.inf, state.dtype))
@@ -114,4 +122,4 @@ def begun(net: Topology, since: EdgeField, now: EdgeField, time: Array) -> EdgeF
     return net.map_springs(moment, since, now)
 
 
-__all__ = ["Onset", "Torn", "Yielded", "begun", "has_yielded", "lengthened", "never", "remembered", "weakened"]
+__all__ = ["Onset", "Torn", "Yielded", "begun", "has_yielded", "lengthened", "never", "of_springs", "remembered", "weakened"]

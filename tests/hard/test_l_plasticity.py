@@ -11,7 +11,7 @@ from jaxspring.plasticity import Yielding
 
 PAIR = js.lattice(2)
 K, YIELD, HARD, DRAG = 100.0, 2.0, 25.0, 0.5
-LOAD, RATE, END = 6.0, 20.0, 0.8  # [N], [rad/s], [s]
+LOAD, RATE, END = 12.0, 20.0, 0.8  # [N], [rad/s], [s]
 
 
 def test_l9_exactly_at_yield():
@@ -56,12 +56,12 @@ def reference():
         found = solve_ivp(rates, (t, END), y, "DOP853", events=event, args=(sign,), rtol=1e-12, atol=1e-14)
         t, y, n_phases = found.t[-1], found.y[:, -1], n_phases + 1
         sign = 0 if sign else int(np.sign(K * (y[0] - y[2])))
-    assert n_phases > 6  # it yields in both directions, several times
+    assert n_phases >= 5  # it yields in both directions
     return y[2:]
 
 
 def swinging(stepper, dts, n_steps):
-    """Plastic stretch and slip at the end with each dt, and its derivative by the yield force, in one program."""
+    """Plastic stretch and slip at the end with each dt, and the derivative of the stretch by the yield force, with that of differences."""
 
     def end(y, dt, frame):
         parts = (js.Springs(PAIR, K, 1.0), js.Drag(DRAG), js.Load(lambda t: js.Vector((jnp.stack([0 * t, LOAD * jnp.sin(RATE * t)]),))))
@@ -72,15 +72,18 @@ def swinging(stepper, dts, n_steps):
         return PAIR.flatten(memory.stretch)[0], PAIR.flatten(memory.slip)[0]
 
     f = jax.jit(jax.value_and_grad(end, has_aux=True))
-    found = [f(YIELD, dt, round(END / dt) * 4 // n_steps - 1) for dt in dts]
-    return np.array([value for value, _ in found]), np.array([slope for _, slope in found])
+    at, h = [(dt, round(END / dt) * 4 // n_steps - 1) for dt in dts], 1e-6
+    found = [f(YIELD, *frame) for frame in at]
+    differences = (f(YIELD + h, *at[-1])[0][0] - f(YIELD - h, *at[-1])[0][0]) / (2 * h)
+    return np.array([value for value, _ in found]), found[-1][1], differences
 
 
 @pytest.mark.parametrize("stepper", [js.SymplecticEuler(), js.VelocityVerlet(), js.BackwardEuler()], ids=lambda s: type(s).__name__)
 def test_l9_cyclic_load_with_dt_halved(stepper):
-    """Plastic stretch and slip tend to those of an integrator that stops at events, with an error of order dt."""
-    values, slopes = swinging(stepper, (4e-3, 2e-3, 1e-3), 800)
+    """Plastic stretch and slip tend to those of an integrator that stops at events, with an error of order dt; derivatives are right."""
+    values, slope, differences = swinging(stepper, (4e-3, 2e-3, 1e-3), 800)
     error = np.abs(values - np.array(reference()))
-    assert np.all(error[-1] < 1.5e-3)
+    assert np.all(error[-1] < 1.5e-3)  # of .08
     assert np.all(error[1:] < 0.75 * error[:-1])
-    assert np.all(np.isfinite(slopes))
+    assert np.all(error[2] < 0.4 * error[0])
+    assert float(slope) == pytest.approx(float(differences), rel=1e-5)

@@ -53,6 +53,7 @@ def main():
         for name, (stretch, pull) in curves.items():
             axes.plot(np.append(0, stretch), np.append(0, pull), label=name, linewidth=1.2)
         axes.set(title=title, xlabel="stretch (m)", ylabel="pull (N)")
+        axes.locator_params(axis="x", nbins=6)
         axes.grid(alpha=0.3)
         if len(curves) > 1:
             axes.legend()

@@ -328,7 +328,7 @@ def test_implicit_steps_yield():
     slip = net.flatten(system.recall(run.state, 2).slip)
     np.testing.assert_array_less(np.abs(net.flatten(system.forces[0].tension(run.state))), (8 + 100 * slip) * (1 + 1e-12))
     taken = js.energy_ledger(system, run.state)["rules"]["Yielding"]["Springs"]
-    assert taken == pytest.approx(-np.sum(8 * slip + 50 * slip**2), rel=1e-11)
+    assert taken == pytest.approx(-float(np.sum(8 * slip + 50 * slip**2)), rel=1e-11)
 
 
 # --- with other parts ------------------------------------------------------------------------------------------------------------------

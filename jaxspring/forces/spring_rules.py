@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 
 from .._checks import is_concrete
@@ -85,9 +84,9 @@ class Breaking(SpringRule):
         # The same kind of field as a step leaves it, also where it was made by hand.
         return state.with_alive(self.net, state.alive_of(self.net))
 
-    def whole(self, state: State, broken: EdgeField) -> EdgeField:
-        """Which springs hold when these have broken, too."""
-        return self.net.map_springs(lambda alive, off: alive & jnp.logical_not(off), living(self.net, state), broken)
+    def whole(self, state: State, unbroken: EdgeField) -> EdgeField:
+        """Which springs hold: those that held, less those that break now."""
+        return self.net.map_springs(lambda alive, holds: alive & holds, living(self.net, state), unbroken)
 
 
 def entries(name: str, value: Any) -> list[tuple[str, Any]]:

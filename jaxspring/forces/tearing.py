@@ -105,7 +105,7 @@ class Tearing(Breaking):
             share = fallen.map(lambda t: 1 - t * t * (3 - 2 * t))
             off = map_living(self.net, state, lambda t: t >= 1, fallen)
         new = Torn(begun(self.net, memory.since, off, state.time), worst, share)
-        return self.keep(state.with_alive(self.net, self.whole(state, off)), new), Status.ok()
+        return self.keep(state.with_alive(self.net, self.whole(state, off.map(jnp.logical_not))), new), Status.ok()
 
     def load(self, state: State) -> EdgeField:
         """What the limit is compared with: the whole strain, or the pull at the whole stiffness [N]; zero where broken."""

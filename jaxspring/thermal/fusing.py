@@ -119,7 +119,7 @@ class Fusing(Breaking):
         """Springs broken where hot, and back where cold and near."""
         melting = self.melting.astype(state.dtype)
         warm = self.net.average(temperature_of(state, "Fusing"))
-        alive = self.whole(state, warm.map(lambda theta: ~(theta < melting)))
+        alive = self.whole(state, warm.map(lambda theta: theta < melting))
         refused = Status.when(Flag.INVALID, ~jnp.isfinite(melting))
         if self.refreezing is None:
             return state.with_alive(self.net, alive), refused

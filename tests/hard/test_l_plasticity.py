@@ -78,6 +78,7 @@ def swinging(stepper, dts, n_steps):
     return np.array([value for value, _ in found]), found[-1][1], differences
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stepper", [js.SymplecticEuler(), js.VelocityVerlet(), js.BackwardEuler()], ids=lambda s: type(s).__name__)
 def test_l9_cyclic_load_with_dt_halved(stepper):
     """Plastic stretch and slip tend to those of an integrator that stops at events, with an error of order dt; derivatives are right."""

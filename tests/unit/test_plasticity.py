@@ -94,6 +94,7 @@ def branches(at, per_second=7):
     return jnp.stack([found["pull"][i], found["stretch"][i], found["stretch"][2 * per_second - 1]])
 
 
+@pytest.mark.slow
 def test_derivatives_on_both_branches():
     """By k, F_y, H and the stretch: those of the closed forms and of central differences, where it yields and where it does not."""
 
@@ -115,6 +116,7 @@ def test_derivatives_on_both_branches():
         np.testing.assert_allclose(found, np.stack(differences, 1), rtol=1e-7, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_lanes_and_single_precision():
     """Under vmap each lane is the run by itself; in float32 the numbers agree to seven digits and stay float32."""
     many = tuple(jnp.asarray(v) for v in ([K, 80.0, K], [YIELD, 1.5, 30.0], [HARD, 0.0, HARD]))
@@ -168,6 +170,7 @@ def torn_pull(at, stretches=(0.0, 0.3, 0.25)):
     return PAIR.flatten(system.forces[0].tension(run.state))[0], run.state
 
 
+@pytest.mark.slow
 def test_a_band_has_a_derivative():
     """At .25 after .3 the pull is that of the worst strain: value and derivatives by k, limit and band are the closed form's."""
 
@@ -252,6 +255,7 @@ def whole():
     return found
 
 
+@pytest.mark.slow
 def test_all_nets_yield_alike(whole):
     """Lattice, graph and overlay give the same points, plastic stretches and torn springs, in the user's order; many of each."""
     system, _, end = whole["lattice"]
@@ -266,6 +270,7 @@ def test_all_nets_yield_alike(whole):
     assert 0 < float(yielded.time) < float(torn.time) < 2.0
 
 
+@pytest.mark.slow
 def test_a_whole_run_keeps_the_laws(whole):
     """No pull is above its yield force, the books close, plastic work is that of the slip, and momentum is kept."""
     for name, net in NETS.items():
@@ -284,6 +289,7 @@ def test_a_whole_run_keeps_the_laws(whole):
         assert taken == pytest.approx(-np.sum(STRENGTH * b + 2.5 * b**2), rel=1e-11)
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_bit_for_bit(whole, tmp_path):
     """Resumed from a half, or from a file, the run is the unbroken one; a file holds what is remembered in the user's order."""
     system, _, end = whole["graph"]
@@ -301,6 +307,7 @@ def test_a_run_goes_on_bit_for_bit(whole, tmp_path):
     np.testing.assert_array_equal(arrays["memory/2/value/stretch/families/0"], stretch)
 
 
+@pytest.mark.slow
 def test_equilibrium_holds_what_has_yielded_and_diffeqsolve_refuses():
     """A static shape keeps the plastic stretch; an adaptive solver names the rules; another system refuses the history."""
     system = js.System(PAIR, 1.0, (js.Springs(PAIR, K, 1.0), js.Gravity([5.0])), free=np.array([False, True]), rules=Yielding(PAIR, YIELD))

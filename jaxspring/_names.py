@@ -60,7 +60,7 @@ PUBLIC: dict[str, dict[str, tuple[str, ...]]] = {
         "steppers.still": ("Still",),
         "thermal.fusing": ("Fusing",),
         "thermal.heat": ("Heat",),
-        "thermal.ledger": ("Account", "Ledger", "energy_ledger"),
+        "thermal.ledger": ("Ledger", "energy_ledger"),
         "inverse.fit": ("Fit", "fit"),
         "inverse.optimisers": ("LBFGS", "Adam", "LeastSquares"),
         "inverse.stopping": ("Stop",),
@@ -115,6 +115,11 @@ PUBLIC: dict[str, dict[str, tuple[str, ...]]] = {
         "linalg.ordering": ("Natural", "Ordering", "ReverseCuthillMcKee"),
         "linalg.skyline": ("SkylineFactor",),
     },
+    "plasticity": {
+        "forces.yielding": ("Yielding",),
+        "forces.tearing": ("Tearing",),
+        "forces.history": ("Onset", "Torn", "Yielded"),
+    },
     "reconstruction": {
         "scenes.reconstruction.scene": ("Reconstruction", "Relaxation"),
         "scenes.reconstruction.pixels": ("PixelSprings",),
@@ -133,6 +138,7 @@ PUBLIC: dict[str, dict[str, tuple[str, ...]]] = {
         "thermal.heat": ("total_heat",),
         "thermal.hot_plane": ("HotPlane",),
         "thermal.latent": ("LatentHeat",),
+        "thermal.ledger": ("Account",),
         "thermal.schemes": ("BackwardEulerHeat", "CrankNicolsonHeat", "ExplicitHeat", "HeatScheme"),
         "thermal.split": ("SplitHeat", "SymmetricSplitHeat"),
         "thermal.stiffness": ("ThermalExpansion", "ThermalStiffness"),

@@ -150,8 +150,12 @@ DOORS: dict[str, Door] = {
         js.thermal.ThermalStiffness,
         {"stiffness": per_spring(), "softening": number(300.0), "melting": number(400.0), "sharpness": number(2.0)},
     ),
+    "Tearing": Door(lambda **a: js.plasticity.Tearing(net(), **a), {"strain": per_spring(), "band": per_spring(0.5)}),
     "UnitVectorLaw": Door(js.fluid.UnitVectorLaw, {"alpha": number(1.0), "beta": number(2.0), "zeta": number(0.5)}),
     "Vector": Door(lambda value: js.Vector((value, value)), {"value": per_node()}),
+    "Yielding": Door(
+        lambda **a: js.plasticity.Yielding(net(), **a), {"yield_force": per_spring(), "hardening": per_spring(), "viscosity": per_spring()}
+    ),
     "adaptation": Door(lambda sigma: js.images.adaptation(image(), sigma, radius=4), {"sigma": number(1.0)}),
     "capacities": Door(
         lambda **a: js.thermal.capacities(net(), **a),
@@ -185,9 +189,9 @@ BY_HAND = {"diffeqsolve", "fit", "check_gradient", "frequency_response", "from_n
 
 # What the library makes and hands out; nobody else builds it.
 MADE_INSIDE = """
-    Account Blocks BoundSystem Energy Equilibrium Finding Fit GradientCheck History Iteration Memory Modes NetBatch NodeDyads
-    OdeInfo OdeResult Overlay Profile Reconstructed Result Resume Scene Selection SkylineFactor SolveInfo Solves
-    SpringBlocks SpringMatrix Status Step Surface Undetermined
+    Account Blocks BoundSystem Energy Equilibrium Finding Fit GradientCheck History Iteration Memory Modes NetBatch
+    NodeDyads OdeInfo OdeResult Onset Overlay Profile Reconstructed Result Resume Scene Selection SkylineFactor
+    SolveInfo Solves SpringBlocks SpringMatrix Status Step Surface Torn Undetermined Yielded
 """
 
 # Objects made of options, other objects, functions or files: no array of the user's enters.

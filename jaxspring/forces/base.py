@@ -184,6 +184,12 @@ class Rule(eqx.Module):
         """The state after this rule, where `state` is what motion and the rules before it left, and what went wrong."""
         return state, Status.ok()
 
+    def overshoot(self, before: State, after: State) -> tuple[int, Array] | None:
+        """Of what it took between these two states, what the step had put there only since the rule acts once in it: of which force, by
+        its place, and how much [J]. Books count it as of the step. None: nothing.
+        """
+        return None
+
     def limit(self, state: State) -> Array | None:
         """Largest stable dt [s]; None where nothing limits it."""
         return None

@@ -28,6 +28,7 @@ from ..topology.edge_field import EdgeField, SpringNumbers, ZeroOutside
 from ..topology.periods import box_of
 from ..vector import Vector
 from .base import Finding, Force, Scene, any_refused
+from .history import has_yielded, lengthened, weakened
 from .in_box import along_axes, check_rest_length, long_springs, turned_springs
 from .laws import Hooke, Law, PowerLaw, TensionOnly, length_of, spring_block, spring_energy, spring_pull
 from .lengths import are_apart, too_short_or_long
@@ -218,7 +219,7 @@ class Springs(Force):
             return ()
         in_box = long_springs(self._near(), self._seen(state), living(self.net, state))
         is_linear = isinstance(self.law, Hooke | TensionOnly)
-        given = state.rest_length is None and is_concrete(self.rest_length) and is_linear
+        given = state.rest_length is None and not has_yielded(self.net, state) and is_concrete(self.rest_length) and is_linear
         if given and not np.any(np.asarray(self.rest_length) > 0):
             # A pull k d takes no square.
             return in_box
@@ -263,13 +264,27 @@ class Springs(Force):
         return self._seen(state).largest() * jnp.asarray(jnp.finfo(state.dtype).eps, state.dtype) / length
 
     def natural_length(self, state: State) -> Array | EdgeField:
-        """Rest length of each spring in this state [m]: the state's own where it has one, else the given one, times the expansion."""
+        """Rest length of each spring in this state [m]: what it would be without yielding, plus the stretch that it has yielded by."""
+        return lengthened(self.net, state, self.unyielded_length(state))
+
+    def unyielded_length(self, state: State) -> Array | EdgeField:
+        """Rest length without yielding [m]: the state's own where it has one, else the given one, times the expansion."""
         changed = state.rest_length_of(self.net)
         l: Any = changed if changed is not None else cast_inexact(self.net.edge_field(self.rest_length, "rest_length"), state.dtype)
         if self.expansion is None:
             return l
         factor = self.net.edge_field(cast_inexact(self.expansion, state.dtype).factor(self.net, state), "factor")
         return map_living(self.net, state, lambda l, factor: l * factor, l, factor)
+
+    def present_stiffness(self, state: State) -> Array | EdgeField:
+        """Stiffness of each spring in this state [N/m]: the given one, or that of its rule, less what tearing has taken of it."""
+        rule = self.stiffness
+        k = self.net.edge_field(rule.stiffness(self.net, state) if isinstance(rule, StiffnessRule) else rule, "stiffness")
+        return weakened(self.net, state, cast_inexact(k, state.dtype))
+
+    def differences(self, state: State) -> EdgeField:
+        """Head minus tail of each spring [m], in the coordinates that they act in."""
+        return self._near().difference(self._seen(state))
 
     @property
     def _follows_position(self) -> bool:
@@ -285,9 +300,7 @@ class Springs(Force):
         return along_axes(self.net, self.axes)
 
     def _constants(self, state: State) -> tuple[Array | EdgeField, Array | EdgeField]:
-        rule = self.stiffness
-        k = self.net.edge_field(rule.stiffness(self.net, state) if isinstance(rule, StiffnessRule) else rule, "stiffness")
-        return cast_inexact((k, self.natural_length(state)), state.dtype)
+        return self.present_stiffness(state), cast_inexact(self.natural_length(state), state.dtype)
 
     def _each(self, state: State, function: Callable[..., Any]) -> EdgeField:
         """`function(d, k, l)` of every spring; zero of a broken one."""
@@ -295,7 +308,7 @@ class Springs(Force):
 
     def _along(self, state: State) -> tuple[EdgeField, Array | EdgeField, Array | EdgeField]:
         k, l = self._constants(state)
-        d = self._near().difference(self._seen(state))
+        d = self.differences(state)
         return d if self.law.needs_no_mask else self._filled(d), k, l
 
     def _filled(self, d: EdgeField) -> EdgeField:

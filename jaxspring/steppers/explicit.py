@@ -26,6 +26,7 @@ from jax import lax
 from jaxtyping import Array
 
 from ..bound import BoundSystem
+from ..forces.history import of_springs
 from ..numerics import any_lane
 from ..state import State
 from ..vector import Vector
@@ -74,8 +75,9 @@ class VelocityVerlet(Stepper):
         return state.moved(x, state.velocity + (0.5 * dt) * (a + a_new)), a_new
 
     def after_rules(self, system: BoundSystem, before: State, moved: State, now: State, dt: Array, memory: Vector) -> Vector:
-        """The acceleration where the rules have left the nodes, made anew in steps in which they changed any."""
+        """The acceleration where the rules have left nodes and springs, made anew in steps in which they changed any."""
         pairs = [*zip(now.position, moved.position, strict=True), *zip(now.velocity, moved.velocity, strict=True)]
+        pairs += zip(of_springs(now), of_springs(moved), strict=True)
         is_changed = jnp.any(jnp.stack([jnp.any(a != b) for a, b in pairs]))
         return lax.cond(any_lane(is_changed), lambda: system.acceleration(now), lambda: memory)
 

@@ -11,18 +11,15 @@ Source: Terzopoulos, Platt and Fleischer (1989): a thermoelastic unit fuses abov
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._arrays import Numbers
 from .._checks import as_inexact, finite, has_shape, nonnegative, positive
-from ..forces.base import Rule, Scene, Step
-from ..forces.living import living
+from ..forces.base import Scene, Step
 from ..forces.molten import Molten, check_springs
-from ..forces.springs import Springs
+from ..forces.spring_rules import Breaking
 from ..numerics import cast_inexact
 from ..state import State
 from ..status import Flag, Status
@@ -50,7 +47,7 @@ class Refreezing(eqx.Module):
         positive("reach", self.reach, "No spring could come back. Leave refreezing out.")
 
 
-class Fusing(Rule):
+class Fusing(Breaking):
     """Springs break at the melting point. Belongs to a system's `rules`, after `Heat`.
 
     Attributes:
@@ -71,11 +68,8 @@ class Fusing(Rule):
     [ True False]
     """
 
-    moves: ClassVar[bool] = False
-    net: Topology
     melting: Array
     refreezing: Refreezing | None
-    springs: Springs | None
 
     def __init__(self, net: Topology, melting: Numbers, refreezing: Refreezing | None = None):
         self.net = net
@@ -88,27 +82,30 @@ class Fusing(Rule):
         self.springs = None
 
     def check(self, scene: Scene) -> None:
-        """Raise ValueError where no `Springs` of the system is on this net, or several that may come back."""
+        """Raise ValueError where no `Springs` of the system is on this net, or several that may come back; or where torn ones would."""
         check_springs("Fusing", self.net, scene.forces)
-        if self.refreezing is not None and len(self._own(scene)) != 1:
+        if self.refreezing is None:
+            return
+        if len(self.places(scene)) != 1:
             raise ValueError(
-                f"refreezing needs one Springs on the net of Fusing, whose rest lengths change; this system has {len(self._own(scene))}."
+                f"refreezing needs one Springs on the net of Fusing, whose rest lengths change; this system has {len(self.places(scene))}."
+            )
+        others = [type(r).__name__ for r in scene.rules if isinstance(r, Breaking) and r.net.identity == self.net.identity]
+        if len(others) > 1:
+            raise ValueError(
+                f"refreezing brings back every broken spring of its net that is cold, those of {', '.join(others)} too. Break them on "
+                f"nets of their own, net.named('second'), or leave refreezing out."
             )
 
     def bind(self, scene: Scene) -> Fusing:
         """The same, knowing the springs that may come back."""
-        springs = None if self.refreezing is None else scene.bound(self._own(scene)[0])
+        springs = None if self.refreezing is None else scene.bound(self.places(scene)[0])
         return cast_inexact(eqx.tree_at(lambda r: r.springs, self, springs, is_leaf=lambda leaf: leaf is None), scene.dtype)
-
-    def _own(self, scene: Scene) -> list[int]:
-        """The places of the springs on this net."""
-        return [i for i, f in enumerate(scene.forces) if isinstance(f, Springs) and f.net.identity == self.net.identity]
 
     def begin(self, state: State) -> State:
         """The state with a bit for every spring and, where springs come back, a rest length of every spring."""
         temperature_of(state, "Fusing")
-        # The same kind of field as a step leaves it, also where it was made by hand.
-        state = state.with_alive(self.net, state.alive_of(self.net))
+        state = super().begin(state)
         if self.refreezing is None or self.springs is None:
             return state
         lengths = state.rest_length_of(self.net)
@@ -122,7 +119,7 @@ class Fusing(Rule):
         """Springs broken where hot, and back where cold and near."""
         melting = self.melting.astype(state.dtype)
         warm = self.net.average(temperature_of(state, "Fusing"))
-        alive = self.net.map_springs(lambda whole, theta: whole & (theta < melting), living(self.net, state), warm)
+        alive = self.whole(state, warm.map(lambda theta: theta < melting))
         refused = Status.when(Flag.INVALID, ~jnp.isfinite(melting))
         if self.refreezing is None:
             return state.with_alive(self.net, alive), refused

@@ -12,6 +12,9 @@ change of the columns to rounding. Momentum is kept alike: what motion and each 
 An impact counts as what it takes of the kinetic energy there, m (e^2 - 1) (n . w)^2 / 2, and as friction: the rest of the step that it
 splits is motion. A node at rest on a floor, which falls g dt^2 in each step and is put back, books nothing.
 
+A spring that yields at once books its plastic work: what motion has put into it above its yield force, as the rule acts once a step, is
+taken back from motion.
+
 Source: first law; the split of kicks is that of m (v''^2 - v^2) / 2 = (dt F + J) . (v + v'') / 2.
 """
 
@@ -113,6 +116,7 @@ class Ledger(Rule):
         motion = jnp.zeros_like(account.motion)
         for i, a, b, x, y in zip(places, stages, stages[1:], columns, columns[1:], strict=False):
             change, given = self._change(a, b, mean, x, y), self._momentum(b) - self._momentum(a)
+            motion, change = self._returned(i, a, b, motion, change)
             momenta = momenta.at[1 + i].add(given)
             books, motion = (books, motion + change) if i < 0 else (books.at[i].add(change), motion)
         if step.impacts is not None:
@@ -130,6 +134,14 @@ class Ledger(Rule):
             books, motion = books.at[i, 0].add(energy), motion.at[0].add(-energy)
             momenta = momenta.at[1 + i].add(momentum).at[0].add(-momentum)
         return books, motion, momenta
+
+    def _returned(self, i: int, a: State, b: State, motion: Array, change: Array) -> tuple[Array, Array]:
+        """The entries of motion and of what rule i changed, where a part of that is motion's."""
+        over = None if i < 0 else self._parts()[1][i].overshoot(a, b)
+        if over is None:
+            return motion, change
+        place, energy = over
+        return motion.at[1 + place].add(-energy), change.at[1 + place].add(energy)
 
     def _change(self, a: State, b: State, mean: Vector, before: Array, after: Array) -> Array:
         """(2 + F,) what happened to the columns between two stages of a step: kicks at the mean velocity of the step [J]."""

@@ -31,6 +31,7 @@ LAYERS = {
     "forces": 3,
     "thermal": 3,
     "fluid": 3,  # public names of forces
+    "plasticity": 3,  # as well
     "masses": 4,
     "nodes": 4,
     "bound": 4,

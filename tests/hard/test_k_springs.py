@@ -486,8 +486,9 @@ def instances():
         "",
     )
     pixels = js.reconstruction.PixelSprings(None, 1.0)
+    field = TWO.edge_field(jnp.ones(1))
     classes = [
-        js.Account(number, number, number, number, number, number),
+        js.thermal.Account(number, number, number, number, number, number),
         *(js.Adam(), js.LBFGS(), js.LeastSquares(), js.inverse.Optax(optax.identity()), js.Stop()),
         *(
             js.fluid.AllPairs(),
@@ -616,6 +617,12 @@ def instances():
             js.inverse.GradientCheck((), 1.0, status),
         ),
         js.inverse.Undetermined(1, {"k": whole}, None, ("k",)),
+        *(
+            js.plasticity.Yielding(TWO, 1.0, hardening=0.5),
+            js.plasticity.Tearing(TWO, strain=0.5),
+            js.plasticity.Onset(whole, whole, number),
+        ),
+        *(js.plasticity.Yielded(field, field, field), js.plasticity.Torn(field, None, None)),
     ]
     return {type(a).__name__: a for a in classes}
 
@@ -629,7 +636,7 @@ def test_k6_the_table_has_every_public_class():
     wanted = {n for n, c in classes.items() if inspect.isclass(c) and not inspect.isabstract(c) and not issubclass(c, Exception)}
     bases = {n for n in wanted if any(classes[n] in type(a).__mro__[1:] for a in INSTANCES.values())}
     assert not wanted - set(INSTANCES) - bases
-    assert Account is js.Account
+    assert Account is js.thermal.Account
 
 
 def is_same(a, b):

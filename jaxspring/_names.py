@@ -70,6 +70,11 @@ PUBLIC: dict[str, dict[str, tuple[str, ...]]] = {
         "inverse.checkpoint": ("Checkpoint",),
         "inverse.check": ("check_gradient",),
     },
+    "contact": {
+        "contact.base": ("Obstacle",),
+        "contact.rule": ("Contact",),
+        "contact.impulses": ("Impulse", "Impulses", "impulses", "push_out"),
+    },
     "fluid": {
         "forces.pair_laws": ("LennardJones", "PairLaw", "SlideLaw", "UnitVectorLaw", "gentle_fluid"),
         "forces.cutoffs": ("Cutoff", "NoCutoff", "PlainCutoff", "ShiftedForce", "Switched"),

@@ -73,7 +73,7 @@ PUBLIC: dict[str, dict[str, tuple[str, ...]]] = {
     "contact": {
         "contact.base": ("Obstacle",),
         "contact.rule": ("Contact",),
-        "contact.impulses": ("Impulse", "Impulses", "impulses", "push_out"),
+        "contact.reactions": ("Impulse", "Impulses", "impulses", "push_out"),
     },
     "fluid": {
         "forces.pair_laws": ("LennardJones", "PairLaw", "SlideLaw", "UnitVectorLaw", "gentle_fluid"),

@@ -9,10 +9,10 @@ from .._lazy import face as _face
 if TYPE_CHECKING:  # written by `python -m tests.face`
     from .base import Obstacle as Obstacle
     from .rule import Contact as Contact
-    from .impulses import Impulse as Impulse
-    from .impulses import Impulses as Impulses
-    from .impulses import impulses as impulses
-    from .impulses import push_out as push_out
+    from .reactions import Impulse as Impulse
+    from .reactions import Impulses as Impulses
+    from .reactions import impulses as impulses
+    from .reactions import push_out as push_out
     from ..forces.contact import Floor as Floor
 else:
     __all__, __getattr__, __dir__ = _face(__name__)

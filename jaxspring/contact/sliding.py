@@ -5,7 +5,7 @@
     j     = -(n . w + d_t) - t b - n . off                                  pressed in the time t, b the bend of the height
     share = min(mu j / |y - drag|, 1)                                       of the slip that friction takes; 1: the node sticks
     place = x + t (begun + t a' / 2 - share (y - drag) / 2 + share off')    then along n onto the surface, by push
-    v     = y - share (y - drag) + push / t + t (a - a') / 2 + (off - off') then moving with the surface where it is
+    v     = y - share (y - drag) + push / t + t (a - a') / 2 + (off - off') then moving with the surface where it is, share by what has pressed
 
 The push is half of what turns the velocity on a curved obstacle, the end the other half. Without friction, that keeps the energy: RATTLE.
 
@@ -30,6 +30,7 @@ from .paths import Path
 if TYPE_CHECKING:
     from .encounters import Encounters, Way
 
+PRESSINGS = 2  # times that friction is made to fit what presses: each leaves an angle's share of the error
 LANDINGS = 3  # steps of Newton's method onto a surface: each doubles the digits
 
 
@@ -47,9 +48,7 @@ def slide(scene: Encounters, path: Path, t: Array, way: Way, bends: tuple[Array,
     w, a, off = path.velocity, scene.acceleration, scene.offset
     begun, pulled, lag = way.velocity, way.acceleration, frame.without(off)
     y = begun + t * pulled + lag
-    pulls = _pulls(scene, path, t, way, bends)
-    pull = sum(pulls[1:], start=pulls[0])
-    parts = [p / jnp.where(pull > 0, pull, jnp.ones_like(pull)) for p in pulls]
+    pull, parts = _pulls(scene, _pressed(scene, path, t, way, bends))
     slip = y - frame.carried(y)
     for part, touch in zip(parts, way.touches, strict=True):
         slip = slip if touch.drag is None else slip - part * frame.without(touch.drag)
@@ -60,7 +59,13 @@ def slide(scene: Encounters, path: Path, t: Array, way: Way, bends: tuple[Array,
     goes = t > 0
     turned = (landed - place) * jnp.where(goes, 1 / jnp.where(goes, t, jnp.ones_like(t)), jnp.zeros_like(t))
     ended = scene.frame(scene.touches(landed, end), path.held)
-    v = ended.onto(y - share * slip + turned + (0.5 * t) * (a - pulled) + (off - lag))
+    free = y + turned + (0.5 * t) * (a - pulled) + (off - lag)
+    for _ in range(PRESSINGS):
+        # By what has pressed in the end, friction keeps to its cone where the obstacle is curved.
+        pushed = ended.onto(free - share * slip) + share * slip - (w + t * a + off)
+        pull, parts = _pulls(scene, frame.shares(tuple(pushed.dot(e) for e in frame.directions)))
+        share = braked(pull, slip)
+    v = ended.onto(free - share * slip)
     books = path.books
     if books is not None:
         given = v - (w + t * a + off) + share * slip
@@ -70,16 +75,22 @@ def slide(scene: Encounters, path: Path, t: Array, way: Way, bends: tuple[Array,
     return dataclasses.replace(path, position=landed, velocity=velocity, arrived=v, left=path.left - t, books=books)
 
 
-def _pulls(scene: Encounters, path: Path, t: Array, way: Way, bends: tuple[Array, ...]) -> list[Array]:
-    """How much tangential velocity the friction of each obstacle can take in the time t [m/s]."""
+def _pressed(scene: Encounters, path: Path, t: Array, way: Way, bends: tuple[Array, ...]) -> tuple[Array, ...]:
+    """What each obstacle will have to take of the velocity along its normal in the time t [m/s]."""
     frame, total = way.frame, path.velocity + t * scene.acceleration + scene.offset
     parts = []
     for touch, bend, e, c in zip(way.touches, bends, frame.directions, frame.speeds, strict=True):
         # Of the surface alone: its curvature along the way, and what it moves by itself.
         turning = bend - way.acceleration.dot(touch.normal)
         parts.append(jnp.where(e.dot(e) > 0, c - total.dot(e) - t * turning, jnp.zeros_like(t)))
-    pressed = frame.shares(tuple(parts))
-    return [s.friction * jnp.maximum(j, jnp.zeros_like(j)) for s, j in zip(scene.surfaces, pressed, strict=True)]
+    return frame.shares(tuple(parts))
+
+
+def _pulls(scene: Encounters, pressed: tuple[Array, ...]) -> tuple[Array, list[Array]]:
+    """How much tangential velocity friction can take [m/s], and which part of that each obstacle's."""
+    pulls = [s.friction * jnp.maximum(j, jnp.zeros_like(j)) for s, j in zip(scene.surfaces, pressed, strict=True)]
+    pull = sum(pulls[1:], start=pulls[0])
+    return pull, [p / jnp.where(pull > 0, pull, jnp.ones_like(pull)) for p in pulls]
 
 
 def _landed(scene: Encounters, place: Vector, frame: Frame, time: Array) -> Vector:

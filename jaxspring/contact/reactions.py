@@ -40,8 +40,7 @@ class Impulses(Rule):
     """Keeps what every obstacle of the system gave in the last step: see `impulses`. It watches, and changes nothing.
 
     Attributes:
-        mass: [kg], once bound.
-        n_obstacles: how many there are, once bound (static).
+        masses: [kg], for each obstacle the same, once bound.
 
     >>> net = js.lattice(2)
     >>> rules = (js.Floor((0.0, 0.0), (0.0, 1.0)), js.contact.Impulses())
@@ -55,29 +54,30 @@ class Impulses(Rule):
     watches: ClassVar[bool] = True
     moves: ClassVar[bool] = False
     breaks: ClassVar[bool] = False
-    mass: Array | None
-    n_obstacles: int = eqx.field(static=True)
+    masses: tuple[Array, ...] | None
 
     def __init__(self) -> None:
-        self.mass, self.n_obstacles = None, 0
+        self.masses = None
 
     def bind(self, scene: Scene) -> Impulses:
         """The same, knowing the masses, and how many obstacles the scene has."""
-        n = sum(rule.is_obstacle for rule in scene.rules)
-        known = (scene.mass, n)
-        return eqx.tree_at(lambda r: (r.mass, r.n_obstacles), self, known, is_leaf=lambda leaf: leaf is None)
+        masses = tuple(scene.mass for rule in scene.rules if rule.is_obstacle)
+        return eqx.tree_at(lambda r: r.masses, self, masses, is_leaf=lambda leaf: leaf is None)
 
     def remember(self, state: State) -> tuple[Impulse, ...]:
         """Nothing given yet, by each obstacle."""
         nothing = Vector.zeros_like(state.position)
-        return tuple(Impulse(nothing, nothing) for _ in range(self.n_obstacles))
+        return tuple(Impulse(nothing, nothing) for _ in self._known())
 
     def update(self, step: Step, state: State) -> tuple[State, Status]:
         """The state with what the step's obstacles gave."""
-        if self.mass is None:
+        pairs = zip(self._known(), step.impacts or (), strict=True)
+        return self.keep(state, tuple(Impulse(mass * book.normal, mass * book.friction) for mass, book in pairs)), Status.ok()
+
+    def _known(self) -> tuple[Array, ...]:
+        if self.masses is None:
             raise ValueError("Impulses knows no masses yet. Put it in System(rules=...), and call rollout, or system.bind(state.dtype).")
-        mass = self.mass.astype(state.dtype)
-        return self.keep(state, tuple(Impulse(mass * book.normal, mass * book.friction) for book in step.impacts or ())), Status.ok()
+        return self.masses
 
 
 def impulses(system: Any, state: State) -> tuple[Impulse, ...]:

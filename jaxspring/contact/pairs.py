@@ -71,7 +71,7 @@ class NodeContact(Force):
     radius: Array
     law: ContactLaw
     rest: Any
-    pairs: Pairs
+    pairs: AllPairs | NeighbourList
     box: Array | None
 
     def __init__(
@@ -111,9 +111,10 @@ class NodeContact(Force):
         self.rest = None if rest is None else as_inexact("rest", rest)
         if self.rest is not None:
             finite("rest", self.rest)
-        self.pairs = AllPairs() if pairs is None else kind("pairs", pairs, Pairs, "NeighbourList(capacity=32, skin=0.05)")
-        if not isinstance(self.pairs, AllPairs | NeighbourList):
-            raise TypeError(f"pairs is a {type(self.pairs).__name__}; expected AllPairs or NeighbourList, which can leave pairs out.")
+        chosen = AllPairs() if pairs is None else kind("pairs", pairs, Pairs, "NeighbourList(capacity=32, skin=0.05)")
+        if not isinstance(chosen, AllPairs | NeighbourList):
+            raise TypeError(f"pairs is a {type(chosen).__name__}; expected AllPairs or NeighbourList, which can leave pairs out.")
+        self.pairs = chosen
         self.box = None
 
     def check(self, scene: Scene) -> None:
@@ -216,8 +217,7 @@ class NodeContact(Force):
         """Whether a constant is negative or not finite, or not positive where it must be."""
         bad = self.law.invalid() | any_refused(self.radius)
         bad = bad if self.rest is None else bad | any_not_finite(*_arrays(self.rest))
-        of_pairs = None if isinstance(self.pairs, AllPairs) else any_refused(self.pairs.skin)
-        return bad if of_pairs is None else bad | of_pairs
+        return bad | any_refused(self.pairs.skin) if isinstance(self.pairs, NeighbourList) else bad
 
     @property
     def _reach(self) -> Array:

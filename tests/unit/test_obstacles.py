@@ -213,8 +213,8 @@ CUBE = hull(np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 
 
 
 def test_a_mesh_that_is_a_box():
-    """Within a spacing of a cube the sampled distance is right to a fiftieth of a spacing, at edges to a fifth; the sign is right; far outside
-    it is a lower bound that is no less than the distance to the grid.
+    """Within a spacing of a cube the sampled distance is right to a fiftieth of a spacing, at edges to a fifth; the sign is right; far
+    outside it is a lower bound that is no less than the distance to the grid.
     """
     points = places(3)
     exact = EXACT["box"][0].__class__((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)).distance(vector(points), NOW)
@@ -236,7 +236,7 @@ def test_a_mesh_that_is_a_box():
 
 
 def test_a_mesh_that_bends_inward_against_all_triangles():
-    """At random places the samples of a body with a notch are the least distance to any of its triangles, negative where rays say inside."""
+    """At random places the samples of a body with a notch are the least distance to any of its triangles, negative inside."""
     from jaxspring.contact.mesh_distance import pseudonormals, signed_distance
 
     # An L of three cubes, extruded: its cross-section by corners, its inside known by coordinates.

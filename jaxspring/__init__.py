@@ -117,7 +117,6 @@ if TYPE_CHECKING:  # written by `python -m tests.face`
     from .steppers.still import Still as Still
     from .thermal.fusing import Fusing as Fusing
     from .thermal.heat import Heat as Heat
-    from .thermal.ledger import Account as Account
     from .thermal.ledger import Ledger as Ledger
     from .thermal.ledger import energy_ledger as energy_ledger
     from .inverse.fit import Fit as Fit

@@ -4,8 +4,8 @@
     n = grad d                  away from the obstacle, of length one where d is the exact distance
     -d_t n / |n|**2      [m/s]  how fast the surface moves along its normal, where d_t is the rate of d at a fixed place
 
-Contact, heat and whatever else meets obstacles asks for nothing but these. The distance is differentiable in place, time and every constant:
-a radius, a centre or the height of a ground may be fitted. Where it has a kink (a centre, an edge, the middle of a box) its derivative is
+Contact, heat and whatever else meets obstacles asks for nothing but these. The distance is differentiable in place, time and every
+constant: a radius, a centre or the height of a ground may be fitted. Where it has a kink (a centre, an edge, the middle of a box) its derivative is
 that of one side, finite, and zero where no side is nearer than another.
 
 Source: Osher and Fedkiw (2003), Level Set Methods and Dynamic Implicit Surfaces, chapter 2.
@@ -123,6 +123,21 @@ def at(constant: Array, position: Vector) -> Vector:
     return Vector(tuple(constant[i].astype(position.dtype) for i in range(position.dim)))
 
 
+def length(v: Vector) -> Array:
+    """Euclidean length, with derivative zero where it is zero. Shorter than `Vector.norm`, since what leaves the range of squares is far
+    outside (infinite), or at the centre (zero), and both are right here.
+    """
+    squared = v.dot(v)
+    is_apart = squared > 0
+    return jnp.where(is_apart, jnp.sqrt(jnp.where(is_apart, squared, jnp.ones_like(squared))), jnp.zeros_like(squared))
+
+
+def unit(v: Vector) -> Vector:
+    """`v` over its length; zero where that is zero."""
+    size = length(v)
+    return v / jnp.where(size > 0, size, jnp.ones_like(size))
+
+
 def any_not_finite(*values: Array) -> Array:
     """True where any entry of any array is NaN or infinite."""
     bad = jnp.zeros((), bool)
@@ -131,4 +146,4 @@ def any_not_finite(*values: Array) -> Array:
     return bad
 
 
-__all__ = ["Obstacle", "any_not_finite", "at", "check_dim", "curvature", "place", "seen", "two_places"]
+__all__ = ["Obstacle", "any_not_finite", "at", "check_dim", "curvature", "length", "place", "seen", "two_places", "unit"]

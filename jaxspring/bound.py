@@ -224,9 +224,7 @@ def _updated(part: Rule, step: Step, state: State) -> tuple[State, Status]:
     return found
 
 
-def _struck(
-    obstacles: tuple[Rule, ...], step: Step, state: State, books: bool, is_kicked: bool
-) -> tuple[State, Status, Books | None]:
+def _struck(obstacles: tuple[Rule, ...], step: Step, state: State, books: bool, is_kicked: bool) -> tuple[State, Status, Books | None]:
     """The state after the impacts of a step: on planes alone by their own pass, which knows when a node meets one in closed form."""
     if all(isinstance(part, Floor) for part in obstacles):
         planes = tuple(part.plane(step.moved) for part in obstacles if isinstance(part, Floor))

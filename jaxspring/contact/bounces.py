@@ -108,7 +108,8 @@ def _hit(scene: Encounters, path: Path, pulled: Vector, touch: Touch, chosen: tu
     slow = out <= (1 + float(jnp.finfo(out.dtype).eps) ** 0.5) * jnp.abs(scene.offset.dot(touch.normal))
     still = scene.is_still(into, bend, pick(chosen, scene.rounding))
     rests = is_hit & (bend < 0) & ((2 * out <= -bend * path.left * (1 - e)) | slow | still)
-    return Hit(touch.normal, lever, e, mu * length, out, drag, (out - into) * lever, rub, -touch.speed(true) * lever, bend, rests, touch.rate)
+    kick, stop = (out - into) * lever, -touch.speed(true) * lever
+    return Hit(touch.normal, lever, e, mu * length, out, drag, kick, rub, stop, bend, rests, touch.rate)
 
 
 def _held(scene: Encounters, path: Path, hit: Hit, touches: tuple[Touch, ...], chosen: tuple[Array, ...]) -> tuple[Array, ...]:

@@ -3,6 +3,8 @@
     impulse of the normal       m (change of velocity along it)          [N s]
     impulse of friction         m (change of velocity along the surface) [N s]
     mean force in the step      impulse / dt                             [N]
+
+Source: momentum.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from ..memory import entry_at
 from ..state import State
 from ..status import Status
 from ..vector import Vector
-from .rule import Contact
+from .rule import Contact, surface_of
 
 SWEEPS = 8  # over all obstacles: out of one may be into another
 
@@ -117,7 +119,7 @@ def push_out(system: Any, state: State) -> State:
     """
     position = state.position
     time = jnp.broadcast_to(state.time, position.shape)
-    surfaces = [rule.surface(state) for rule in system.rules or () if isinstance(rule, Floor | Contact)]
+    surfaces = [surface_of(rule, state) for rule in system.rules or () if isinstance(rule, (Floor, Contact))]
     for _ in range(SWEEPS):
         for surface in surfaces:
             touch = surface.touch(position, time, jnp.zeros_like(time))

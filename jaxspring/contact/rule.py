@@ -47,7 +47,7 @@ class Contact(Rule):
         TypeError: what is no obstacle.
 
     >>> net = js.lattice(2)
-    >>> ball = js.contact.Contact(js.contact.SignedDistance(lambda x, t: x.norm() - 1.0), restitution=1.0)
+    >>> ball = js.contact.Contact(js.contact.Sphere((0.0, 0.0), 1.0), restitution=1.0)
     >>> system = js.System(net, 1.0, js.Gravity((0.0, -10.0)), rules=ball)
     >>> start = js.State.from_points(net, [[0.0, 1.8], [3.0, 0.0]])
     >>> print(js.rollout(system, start, js.VelocityVerlet(), dt=0.1, n_steps=8).state.points[0].round(3))
@@ -120,9 +120,7 @@ class Contact(Rule):
         return bad if obstacle is None else bad | obstacle
 
 
-def strike(
-    obstacles: tuple[Rule, ...], step: Step, state: State, books: bool, is_kicked: bool
-) -> tuple[State, Status, Books | None]:
+def strike(obstacles: tuple[Rule, ...], step: Step, state: State, books: bool, is_kicked: bool) -> tuple[State, Status, Books | None]:
     """The state after the impacts of a step on all these obstacles, whatever their order, and what went wrong: by the pass of planes, where
     they are all planes, else by that of any surface.
 
@@ -136,17 +134,26 @@ def strike(
     Raises:
         TypeError: an obstacle that is neither `Floor` nor `Contact`.
     """
-    others = [type(rule).__name__ for rule in obstacles if not isinstance(rule, Floor | Contact)]
+    others = [type(rule).__name__ for rule in obstacles if not isinstance(rule, (Floor, Contact))]
     if others:
         raise TypeError(f"{others[0]} counts as an obstacle, but only Floor and Contact can be one.")
-    known = tuple(rule for rule in obstacles if isinstance(rule, Floor | Contact))
+    known = tuple(rule for rule in obstacles if isinstance(rule, (Floor, Contact)))
     flat = tuple(rule.plane(step.moved) for rule in known)
     planes = tuple(plane for plane in flat if plane is not None)
     if len(planes) == len(known):
         return strike_planes(planes, step, state, books, is_kicked)
-    surfaces = [rule.surface(step.moved) if isinstance(rule, Contact) and plane is None else plane for rule, plane in zip(known, flat, strict=True)]
-    flattened = tuple(Surface(Flat(s), s.friction, s.restitution) if isinstance(s, Plane) else s for s in surfaces if s is not None)
-    return strike_surfaces(flattened, step, state, books, is_kicked)
+    return strike_surfaces(tuple(surface_of(rule, step.moved) for rule in known), step, state, books, is_kicked)
 
 
-__all__ = ["Contact", "strike"]
+def surface_of(rule: Floor | Contact, state: State) -> Surface:
+    """An obstacle as an impact sees it, a plane as one that is met in closed form."""
+    if isinstance(rule, Contact):
+        plane = rule.plane(state)
+        if plane is None:
+            return rule.surface(state)
+    else:
+        plane = rule.plane(state)
+    return Surface(Flat(plane), plane.friction, plane.restitution)
+
+
+__all__ = ["Contact", "strike", "surface_of"]

@@ -5,7 +5,7 @@
     j     = -(n . w + d_t) - t b - n . off                                  pressed in the time t, b the bend of the height
     share = min(mu j / |y - drag|, 1)                                       of the slip that friction takes; 1: the node sticks
     place = x + t (begun + t a' / 2 - share (y - drag) / 2 + share off')    then along n onto the surface, by push
-    v     = y - share (y - drag) + push / t + t (a - a') / 2 + (off - off') then moving with the surface where it is, share by what has pressed
+    v     = y - share (y - drag) + push / t + t (a - a') / 2 + (off - off') then moving with the surface there; share by all that pressed
 
 The push is half of what turns the velocity on a curved obstacle, the end the other half. Without friction, that keeps the energy: RATTLE.
 

@@ -123,8 +123,9 @@ def _ordered(surfaces: tuple[Surface, ...]) -> tuple[tuple[Surface, ...], tuple[
             for place, i in enumerate(own):
                 at[i][first + place] = yes
             continue
+        none = jnp.zeros((), jnp.int32)
         before = [
-            sum(goes_first(k, key, n < m).astype(jnp.int32) for n, k in enumerate(keys) if n != m) for m, key in enumerate(keys)
+            sum((goes_first(k, key, n < m).astype(jnp.int32) for n, k in enumerate(keys) if n != m), none) for m, key in enumerate(keys)
         ]
         for place in range(len(own)):
             chosen = tuple(b == place for b in before)

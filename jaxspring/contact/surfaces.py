@@ -87,7 +87,7 @@ class Surface(eqx.Module):
         return _by_node(_along, self.obstacle, s, position, velocity, acceleration, time, base)
 
     def bend(self, position: Vector, velocity: Vector, acceleration: Vector, time: Array) -> Array:
-        """Acceleration of the height along the parabola of each node from its place and time [m/s^2]: toward the obstacle where negative."""
+        """Acceleration of the height along the parabola of each node from its place and time [m/s^2]: negative toward the obstacle."""
         return lax.optimization_barrier(_by_node(_bend, self.obstacle, position, velocity, acceleration, time))
 
     def rounding(self, position: Vector) -> Array:

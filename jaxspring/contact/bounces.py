@@ -13,7 +13,6 @@ Source: as in `forces/impacts.py`.
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -25,11 +24,9 @@ from ..forces.contact import Book
 from ..forces.planes import braked, pick
 from ..numerics import any_lane, tiny
 from ..vector import Vector
+from .passage import Passage
 from .paths import Path
 from .surfaces import Touch, picked
-
-if TYPE_CHECKING:
-    from .encounters import Encounters
 
 
 class Hit(eqx.Module):
@@ -64,7 +61,7 @@ class Hit(eqx.Module):
     rate: Array
 
 
-def thrown(scene: Encounters, path: Path, pulled: Vector, chosen: tuple[Array, ...], is_hit: Array, is_late: Array) -> Path:
+def thrown(scene: Passage, path: Path, pulled: Vector, chosen: tuple[Array, ...], is_hit: Array, is_late: Array) -> Path:
     """The path after the impact that it has come to, on the chosen surface; `pulled` is the acceleration that brought it there."""
     touches = scene.touches(path.position, scene.clock(path))
     touch = picked(chosen, touches)
@@ -91,7 +88,7 @@ def thrown(scene: Encounters, path: Path, pulled: Vector, chosen: tuple[Array, .
     return lax.cond(any_lane(jnp.any(more)), lambda p: _hops(scene, p, hit, chosen, more), lambda p: p, after)
 
 
-def _hit(scene: Encounters, path: Path, pulled: Vector, touch: Touch, chosen: tuple[Array, ...], is_hit: Array) -> Hit:
+def _hit(scene: Passage, path: Path, pulled: Vector, touch: Touch, chosen: tuple[Array, ...], is_hit: Array) -> Hit:
     """What the impact is."""
     clock = scene.clock(path)
     e, mu = (pick(chosen, values) for values in zip(*((s.restitution, s.friction) for s in scene.surfaces), strict=True))
@@ -112,7 +109,7 @@ def _hit(scene: Encounters, path: Path, pulled: Vector, touch: Touch, chosen: tu
     return Hit(touch.normal, lever, e, mu * length, out, drag, kick, rub, stop, bend, rests, touch.rate)
 
 
-def _held(scene: Encounters, path: Path, hit: Hit, touches: tuple[Touch, ...], chosen: tuple[Array, ...]) -> tuple[Array, ...]:
+def _held(scene: Passage, path: Path, hit: Hit, touches: tuple[Touch, ...], chosen: tuple[Array, ...]) -> tuple[Array, ...]:
     """On which obstacles each node rests after the impact: on this one, and on those that it stays pressed to."""
     if len(scene.surfaces) == 1:
         return (hit.rests,)
@@ -123,7 +120,7 @@ def _held(scene: Encounters, path: Path, hit: Hit, touches: tuple[Touch, ...], c
     return tuple(hit.rests & (c | s) for c, s in zip(chosen, stays, strict=True))
 
 
-def _hops(scene: Encounters, path: Path, hit: Hit, chosen: tuple[Array, ...], more: Array) -> Path:
+def _hops(scene: Passage, path: Path, hit: Hit, chosen: tuple[Array, ...], more: Array) -> Path:
     """After all further bounces on the same obstacle that fit into the time left, where no other is in their way."""
     e, left, one, zero = hit.restitution, path.left, jnp.ones_like(path.left), jnp.zeros_like(path.left)
     decays = e < 1

@@ -15,7 +15,6 @@ Source: Andersen (1983), "Rattle: a velocity version of the Shake algorithm".
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
 from jax import lax
@@ -25,16 +24,14 @@ from ..forces.contact import Book
 from ..forces.planes import braked
 from ..vector import Vector
 from .frames import Frame
+from .passage import Passage, Way
 from .paths import Path
-
-if TYPE_CHECKING:
-    from .encounters import Encounters, Way
 
 PRESSINGS = 2  # times that friction is made to fit what presses: each leaves an angle's share of the error
 LANDINGS = 3  # steps of Newton's method onto a surface: each doubles the digits
 
 
-def slide(scene: Encounters, path: Path, t: Array, way: Way, bends: tuple[Array, ...]) -> Path:
+def slide(scene: Passage, path: Path, t: Array, way: Way, bends: tuple[Array, ...]) -> Path:
     """A time t later, where nothing else is met on the way. What rests on nothing flies.
 
     Args:
@@ -75,7 +72,7 @@ def slide(scene: Encounters, path: Path, t: Array, way: Way, bends: tuple[Array,
     return dataclasses.replace(path, position=landed, velocity=velocity, arrived=v, left=path.left - t, books=books)
 
 
-def _pressed(scene: Encounters, path: Path, t: Array, way: Way, bends: tuple[Array, ...]) -> tuple[Array, ...]:
+def _pressed(scene: Passage, path: Path, t: Array, way: Way, bends: tuple[Array, ...]) -> tuple[Array, ...]:
     """What each obstacle will have to take of the velocity along its normal in the time t [m/s]."""
     frame, total = way.frame, path.velocity + t * scene.acceleration + scene.offset
     parts = []
@@ -86,14 +83,14 @@ def _pressed(scene: Encounters, path: Path, t: Array, way: Way, bends: tuple[Arr
     return frame.shares(tuple(parts))
 
 
-def _pulls(scene: Encounters, pressed: tuple[Array, ...]) -> tuple[Array, list[Array]]:
+def _pulls(scene: Passage, pressed: tuple[Array, ...]) -> tuple[Array, list[Array]]:
     """How much tangential velocity friction can take [m/s], and which part of that each obstacle's."""
     pulls = [s.friction * jnp.maximum(j, jnp.zeros_like(j)) for s, j in zip(scene.surfaces, pressed, strict=True)]
     pull = sum(pulls[1:], start=pulls[0])
     return pull, [p / jnp.where(pull > 0, pull, jnp.ones_like(pull)) for p in pulls]
 
 
-def _landed(scene: Encounters, place: Vector, frame: Frame, time: Array) -> Vector:
+def _landed(scene: Passage, place: Vector, frame: Frame, time: Array) -> Vector:
     """From a place near the surfaces that hold a node, along the normals where it began, onto them."""
 
     def nearer(place: Vector, _: None) -> tuple[Vector, None]:
@@ -107,7 +104,7 @@ def _landed(scene: Encounters, place: Vector, frame: Frame, time: Array) -> Vect
     return lax.scan(nearer, place, None, length=LANDINGS)[0]
 
 
-def _entered(scene: Encounters, path: Path, way: Way, given: Vector, slip: Vector, shares: list[tuple[Array, Array]]) -> tuple[Book, ...]:
+def _entered(scene: Passage, path: Path, way: Way, given: Vector, slip: Vector, shares: list[tuple[Array, Array]]) -> tuple[Book, ...]:
     """The books with a slide: what the normals gave together, and of each obstacle which share of the slip friction took, and its work."""
     pressed = way.frame.shares(tuple(given.dot(e) for e in way.frame.directions))
     normals = [j * scene.free_part(touch.normal) for j, touch in zip(pressed, way.touches, strict=True)]

@@ -17,7 +17,8 @@ from ..numerics import any_lane
 from ..state import State
 from ..status import Flag, Status
 from ..vector import Vector
-from .encounters import Encounters
+from .encounters import follow, is_any_near
+from .passage import Passage
 from .paths import Path
 from .surfaces import Surface
 
@@ -52,7 +53,7 @@ def strike(
         return moved.position, moved.velocity, path.books, jnp.zeros_like(path.is_struck)
 
     # Most steps of most scenes bring no node near: they pay for a distance alone.
-    position, velocity, told, unfinished = lax.cond(any_lane(scene.is_any_near(path)), met, passed, path)
+    position, velocity, told, unfinished = lax.cond(any_lane(is_any_near(scene, path)), met, passed, path)
     # Another rule may have moved or kicked nodes since: then what the impacts change is added to that.
     if is_kicked:
         position = state.position + (position - moved.position)
@@ -64,10 +65,10 @@ def strike(
     return after, status, None if told is None else tuple(_entry(chosen, told) for chosen in order)
 
 
-_followed = eqx.filter_jit(lambda scene, path: scene.follow(path))  # traced once in a run, which holds a step at several places
+_followed = eqx.filter_jit(follow)  # traced once in a run, which holds a step at several places
 
 
-def _begun(surfaces: tuple[Surface, ...], step: Step, books: bool) -> tuple[Encounters, Path]:
+def _begun(surfaces: tuple[Surface, ...], step: Step, books: bool) -> tuple[Passage, Path]:
     """The step as a parabola, and every node at its beginning. With dt <= 0 no time is left, in which nothing is met."""
     before, moved = step.before, step.moved
     goes = step.dt > 0
@@ -78,7 +79,7 @@ def _begun(surfaces: tuple[Surface, ...], step: Step, books: bool) -> tuple[Enco
     free = step.free if step.free is not None else (None,) * moved.dim
     rounding = tuple(s.rounding(before.position) for s in surfaces)
     base = tuple(_base(s, before, least) for s, least in zip(surfaces, rounding, strict=True))
-    scene = Encounters(surfaces, free, base, rounding, before.time, dt, a, moved.velocity - (u + dt * a))
+    scene = Passage(surfaces, free, base, rounding, before.time, dt, a, moved.velocity - (u + dt * a))
     left = jnp.broadcast_to(jnp.where(goes, step.dt, jnp.zeros_like(step.dt)), moved.position.shape)
     nothing, none = jnp.zeros_like(left), Vector.zeros_like(u)
     asks = step.by_velocity is not None

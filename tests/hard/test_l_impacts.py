@@ -13,16 +13,25 @@ PAIR = js.lattice(2)
 
 
 class Body(js.contact.Obstacle):
-    """A disc, or a plane that swings along y; which of them, by `is_disc`."""
+    """A disc, or a plane, that swings along y; which of them, by `is_disc`. Its surface runs along itself, to the right above."""
 
     centre: jax.Array
     normal: jax.Array
     radius: jax.Array
     swing: jax.Array
     is_disc: jax.Array
+    runs: jax.Array
+
+    def from_centre(self, position, time):
+        return position - js.Vector((self.centre[0], self.centre[1] + self.swing[0] * jnp.sin(self.swing[1] * time)))
+
+    def velocity(self, position, time):
+        here = self.from_centre(position, time)
+        n = js.Vector(tuple(jnp.where(self.is_disc > 0, a / here.norm(), b) for a, b in zip(here, self.normal, strict=True)))
+        return self.runs * js.Vector((n.y, -n.x))
 
     def distance(self, position, time):
-        here = position - js.Vector((self.centre[0], self.centre[1] + self.swing[0] * jnp.sin(self.swing[1] * time)))
+        here = self.from_centre(position, time)
         plane = here.dot(js.Vector((self.normal[0], self.normal[1])))
         return jnp.where(self.is_disc > 0, here.norm() - self.radius, plane)
 
@@ -63,9 +72,9 @@ def obstacles(p, disc, corner):
     """A body, and a second plane: far below, or with the first a corner that opens upward."""
     nought, one = jnp.zeros(()), jnp.ones(())
     tilt = jnp.where(corner > 0, np.pi / 4, 0.0)
-    first = Body(jnp.zeros(2), jnp.stack([jnp.sin(tilt), jnp.cos(tilt)]), p[10], p[11:13], disc)
+    first = Body(jnp.zeros(2), jnp.stack([jnp.sin(tilt), jnp.cos(tilt)]), p[10], p[11:13], disc, nought)
     normal = jnp.stack([-jnp.sin(tilt), jnp.cos(tilt)])
-    second = Body(jnp.stack([nought, jnp.where(corner > 0, 0.0, -1e3)]), normal, one, jnp.stack([nought, one]), nought)
+    second = Body(jnp.stack([nought, jnp.where(corner > 0, 0.0, -1e3)]), normal, one, jnp.stack([nought, one]), nought, nought)
     return first, second
 
 
@@ -175,9 +184,9 @@ class Scene(eqx.Module):
 SIX, STEPS = js.lattice(6), 200
 
 
-def body(centre=(0.0, -1e3), normal=(0.0, 1.0), radius=1.0, is_disc=0.0):
+def body(centre=(0.0, -1e3), normal=(0.0, 1.0), radius=1.0, is_disc=0.0, runs=0.0):
     """A body that stands still; far away unless said."""
-    return Body(np.array(centre), np.array(normal), np.array(radius), np.array([0.0, 1.0]), np.array(is_disc))
+    return Body(np.array(centre), np.array(normal), np.array(radius), np.array([0.0, 1.0]), np.array(is_disc), np.array(runs))
 
 
 def scene(first, points, velocities=0.0, friction=0.0, restitution=0.0, g=10.0, dt=0.01, second=None):
@@ -219,6 +228,7 @@ ROWS = {
     "thrown": scene(WALLS[0], **THROWN, friction=(0.3, 0.2), restitution=(0.6, 0.8), second=WALLS[1]),
     "swapped": scene(WALLS[1], **THROWN, friction=(0.2, 0.3), restitution=(0.8, 0.6), second=WALLS[0]),
     "elastic": scene(WALLS[0], **THROWN, restitution=1.0, second=WALLS[1]),
+    "belt": scene(body((0.0, 0.0), runs=1.0), np.c_[np.arange(6), np.zeros(6)], np.c_[0.4 * np.arange(6) - 1, np.zeros(6)], 0.2),
     "fast": scene(
         body((0.0, 0.0), radius=0.01, is_disc=1.0), np.c_[np.full(6, -0.07), MISSES], (10.0, 0.0), restitution=1.0, g=0.0, dt=0.02
     ),
@@ -253,6 +263,18 @@ def test_l2_a_node_at_the_cone_of_friction(flown):
     np.testing.assert_array_equal(x[-1, :4], x[0, :4])
     np.testing.assert_allclose(x[-1, :4], np.c_[np.sin(LEAN), np.cos(LEAN)][:4], atol=1e-15)
     assert np.all(np.abs(x[-1, 4:, 0]) > np.abs(x[0, 4:, 0]) + 0.01)
+
+
+@pytest.mark.slow
+def test_a_belt_that_runs_carries_what_lies_on_it(flown):
+    """Friction brings every node to the speed of the belt, at mu g, and holds it there."""
+    x, v, _, _ = flown["belt"]
+    begun, t = ROWS["belt"].velocities[:, 0], 0.01 * np.arange(1, STEPS + 1)[:, None]
+    until = np.abs(1 - begun) / 2.0
+    np.testing.assert_allclose(v[..., 0], np.where(t < until, begun + 2.0 * np.sign(1 - begun) * t, 1.0), atol=1e-9)
+    gap = 0.5 * 2.0 * np.sign(1 - begun) * until**2
+    np.testing.assert_allclose(x[-1, :, 0], np.arange(6) + t[-1] - gap, atol=2e-3)  # the step in which it takes hold
+    np.testing.assert_allclose(x[..., 1], 0, atol=1e-12)
 
 
 @pytest.mark.slow
@@ -394,3 +416,41 @@ def test_a_belt_on_a_disc_and_a_chain_off_a_table():
     assert speed[1].max() < 2 * surplus
     hanging = -points[2][0, 1] + 0.5 / N
     assert hanging == pytest.approx(0.3 * np.cosh(np.sqrt(10.0) * 0.3), rel=0.01)
+
+
+def test_nodes_inside_are_counted_and_can_be_moved_out():
+    """INSIDE counts the nodes and names the deepest; `push_out` puts them on the surface, and leaves those outside where they are."""
+    ball = js.contact.Contact(js.contact.Sphere((0.0, 0.0), 1.0))
+    start = js.State.from_points(SIX, [[0.9, 0.0], [0.0, 0.5], [2.0, 0.0], [0.0, 1.0], [-0.7, 0.0], [3.0, 3.0]])
+    (found,) = ball.diagnose(start)
+    assert (found.flag, int(found.count), int(found.node)) == (js.Flag.INSIDE, 3, 1)
+    rules = (ball, js.Floor((0.0, 2.5), (0.0, -1.0)))
+    out = js.contact.push_out(js.System(SIX, 1.0, rules=rules), start)
+    np.testing.assert_allclose(out.points, [[1.0, 0.0], [0.0, 1.0], [2.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [3.0, 2.5]], atol=1e-15)
+    assert int(ball.diagnose(out)[0].count) == 0
+
+
+def test_a_flat_obstacle_that_stands_still_is_a_floor():
+    """Its plane is the floor's, so that it is met in closed form; one that moves is none."""
+    state = js.State.from_points(SIX, np.random.default_rng(2).normal(size=(6, 2)))
+    flat, floor = js.contact.Contact(js.contact.Plane((1.0, 2.0), (3.0, 4.0)), 0.25, 0.5), js.Floor((1.0, 2.0), (3.0, 4.0), 0.25, 0.5)
+    a, b = flat.plane(state), floor.plane(state)
+    np.testing.assert_allclose(a.height(state.position), b.height(state.position), atol=1e-15)
+    np.testing.assert_allclose([*a.normal, a.friction, a.restitution], [*b.normal, b.friction, b.restitution], atol=1e-15)
+    assert js.contact.Contact(js.contact.Moving(flat.obstacle, lambda t: jnp.stack([t, t]))).plane(state) is None
+    assert js.contact.Contact(js.contact.Sphere((0.0, 0.0), 1.0)).plane(state) is None
+
+
+def test_what_a_contact_refuses():
+    """What is no obstacle, coefficients that feed energy in, another space: each by name."""
+    ball = js.contact.Sphere((0.0, 0.0, 0.0), 1.0)
+    with pytest.raises(TypeError, match="obstacle"):
+        js.contact.Contact(1.0)
+    with pytest.raises(ValueError, match="friction"):
+        js.contact.Contact(ball, -0.1)
+    with pytest.raises(ValueError, match="restitution"):
+        js.contact.Contact(ball, 0.1, 1.1)
+    with pytest.raises(ValueError, match="3 coordinates"):
+        js.contact.Contact(ball).distance(js.State.from_points(SIX, np.zeros((6, 2))))
+    with pytest.raises(ValueError, match="Impulses"):
+        js.contact.impulses(js.System(SIX, 1.0), js.State.from_points(SIX, np.zeros((6, 2))))

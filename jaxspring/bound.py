@@ -17,7 +17,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array
 
 from .forces.base import Force, Rule, Scene, Step, acts
-from .forces.contact import strike
+from .forces.contact import Books, Floor, strike
 from .forces.linearisation import Linearisation
 from .linalg.operators import Blocks
 from .memory import Owner, entry_at, matched, without_caches
@@ -134,7 +134,7 @@ class BoundSystem(Nodes):
                 stages += [] if isinstance(part, Force) else [(i, state)]
         if obstacles:
             is_kicked = any(part.moves for _, part in followers if not part.is_obstacle)
-            state, status, impacts = strike(tuple(part for _, part in obstacles), step, state, bool(watchers), is_kicked)
+            state, status, impacts = _struck(tuple(part for _, part in obstacles), step, state, bool(watchers), is_kicked)
             total = total.then(_placed(status, obstacles[0][0]))
             stages.append((-1, state))
         step = replace(step, stages=tuple(stages), impacts=impacts)
@@ -222,6 +222,16 @@ def _updated(part: Rule, step: Step, state: State) -> tuple[State, Status]:
             f"{name}.update keeps another structure, shape or type than {name}.remember gave. A memory's shapes must not change."
         )
     return found
+
+
+def _struck(obstacles: tuple[Rule, ...], step: Step, state: State, books: bool, is_kicked: bool) -> tuple[State, Status, Books | None]:
+    """The state after the impacts of a step: on planes alone by their own pass, which knows when a node meets one in closed form."""
+    if all(isinstance(part, Floor) for part in obstacles):
+        planes = tuple(part.plane(step.moved) for part in obstacles if isinstance(part, Floor))
+        return strike(planes, step, state, books, is_kicked)
+    from .contact.rule import strike as strike_any
+
+    return strike_any(obstacles, step, state, books, is_kicked)
 
 
 def _placed(status: Status, effect: int) -> Status:

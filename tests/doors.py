@@ -77,6 +77,9 @@ DOORS: dict[str, Door] = {
     "Combined": Door(
         lambda weights: js.images.Combined((js.images.Intensity(), js.images.Curvature()), weights), {"weights": np.array([1.0, 2.0])}
     ),
+    "Contact": Door(
+        lambda **a: js.contact.Contact(js.contact.Sphere((0.0, 0.0), 1.0), **a), {"friction": number(0.25), "restitution": number(0.5)}
+    ),
     "Convection": Door(
         lambda **a: js.thermal.Convection(net(), **a),
         {"nodes": PATTERN, "coefficient": per_node(), "ambient": per_node(280), "area": per_node()},
@@ -189,8 +192,8 @@ BY_HAND = {"diffeqsolve", "fit", "check_gradient", "frequency_response", "from_n
 
 # What the library makes and hands out; nobody else builds it.
 MADE_INSIDE = """
-    Account Blocks BoundSystem Energy Equilibrium Finding Fit GradientCheck History Iteration Memory Modes NetBatch
-    NodeDyads OdeInfo OdeResult Onset Overlay Profile Reconstructed Result Resume Scene Selection SkylineFactor
+    Account Blocks BoundSystem Energy Equilibrium Finding Fit GradientCheck History Impulse Iteration Memory Modes
+    NetBatch NodeDyads OdeInfo OdeResult Onset Overlay Profile Reconstructed Result Resume Scene Selection SkylineFactor
     SolveInfo Solves SpringBlocks SpringMatrix Status Step Surface Torn Undetermined Yielded
 """
 
@@ -199,14 +202,14 @@ NO_ARRAYS = """
     AllPairs Adam BDF2 BackwardEuler BackwardEulerHeat Bilinear BlockJacobi Bounded CG Cells Channel Checkpoint CheckpointError
     Checkpointed ConstantsSettings CrankNicolsonHeat CubicSpline Curvature Cutoff EnergyLaw EqualCells ExactSolver ExactTangent
     ExpansionRule ExplicitHeat Flag Force ForwardEuler GradientMagnitude GradientWarning HalfCells HeatIteration HeatScheme Hooke
-    Identity ImageError ImplicitMidpoint Intensity Jacobi JaxCG LBFGS Lattice Law LeastSquares Ledger LinearSolver Linearisation
+    Identity ImageError ImplicitMidpoint Impulses Intensity Jacobi JaxCG LBFGS Lattice Law LeastSquares Ledger LinearSolver Linearisation
     Lineax Luminance Molten Multigrid Natural Newton NoCutoff Observation Optax Optimiser Ordering PairLaw Pairs Positive PowerLaw
     Preconditioner Progress PullLaw Reconstruction Relaxation ReverseCuthillMcKee Rule RungeKutta4 Sampling Secant SemiImplicit
     SimulationError Skyline SoftPositive SplitHeat SpringSettings StabilityWarning Stepper StiffnessRule Still Stop StopReason
     StoreAll StoreStates SymmetricSplitHeat SymplecticEuler Tangent TensionOnly ThermalBoundary Topology Transform Unpreconditioned
-    VelocityVerlet animate batch domain elevation_model pad_nets
-    energy_ledger equilibrium fit_constants fit_springs from_mesh gradient_magnitude load
-    load_image melted_fraction normal_modes principal_curvatures raise_for_status save save_trajectory select smoothing_radius
+    VelocityVerlet animate batch domain elevation_model energy_ledger equilibrium fit_constants fit_springs from_mesh
+    gradient_magnitude impulses load load_image melted_fraction normal_modes pad_nets principal_curvatures push_out
+    raise_for_status save save_trajectory select smoothing_radius
     stable_dt total_heat
 """
 

@@ -8,8 +8,10 @@ The step is split where a node meets a plane: see `impacts.py`, which holds the 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, ClassVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,8 +29,29 @@ from .impacts import Impacts, Path
 from .planes import Plane, pick, without
 
 
+def coefficients(friction: Numbers, restitution: Numbers) -> tuple[Array, Array]:
+    """Friction and restitution of an obstacle, as arrays.
+
+    Raises:
+        ValueError: a negative one, a restitution above 1, an array in the place of a number.
+    """
+    mu, e = as_inexact("friction", friction), as_inexact("restitution", restitution)
+    for name, value in (("friction", mu), ("restitution", e)):
+        has_shape(name, value, {"one number": ()})
+        nonnegative(name, value, "It would feed energy in.")
+    if is_concrete(e) and np.asarray(e) > 1:
+        raise ValueError(f"restitution = {e} throws nodes back faster than they came. Pass 0 to 1.")
+    return mu, e
+
+
+def refused(friction: Array, restitution: Array) -> Array:
+    """Whether a coefficient is one that `coefficients` refuses."""
+    return any_refused(friction, restitution) | (restitution > 1)
+
+
 class Floor(Rule):
-    """A plane that nothing passes. Belongs to a system's `rules`; all floors act together, after the other rules.
+    """A plane that nothing passes: `js.contact.Contact` with a plane. Belongs to a system's `rules`; all obstacles act together, after the
+    other rules.
 
     A node that begins a step below the plane counts from where it is: it goes no deeper, and is not lifted. Held nodes and held
     coordinates stay.
@@ -59,12 +82,7 @@ class Floor(Rule):
 
     def __init__(self, point: Numbers, normal: Numbers, friction: Numbers = 0.0, restitution: Numbers = 0.0):
         self.point, self.normal = plane(point, normal)
-        self.friction, self.restitution = as_inexact("friction", friction), as_inexact("restitution", restitution)
-        for name, value in (("friction", self.friction), ("restitution", self.restitution)):
-            has_shape(name, value, {"one number": ()})
-            nonnegative(name, value, "It would feed energy in.")
-        if is_concrete(self.restitution) and np.asarray(self.restitution) > 1:
-            raise ValueError(f"restitution = {self.restitution} throws nodes back faster than they came. Pass 0 to 1.")
+        self.friction, self.restitution = coefficients(friction, restitution)
 
     def height(self, state: State) -> Array:
         """(x - p) . n of each node [m], in node shape."""
@@ -72,12 +90,12 @@ class Floor(Rule):
 
     def update(self, step: Step, state: State) -> tuple[State, Status]:
         """The state after all impacts of the step on this plane."""
-        state, status, _ = strike((self,), step, state)
+        state, status, _ = strike((self.plane(step.moved),), step, state)
         return state, status
 
     def invalid(self) -> Array:
         """Whether a coefficient is one that the constructor refuses."""
-        return any_refused(self.friction, self.restitution) | (self.restitution > 1)
+        return refused(self.friction, self.restitution)
 
     def plane(self, state: State) -> Plane:
         """The plane in the dtype of the state.
@@ -91,36 +109,45 @@ class Floor(Rule):
         return Plane(point, normal, self.friction.astype(state.dtype), self.restitution.astype(state.dtype))
 
 
-Books = tuple[tuple[Array, ...], tuple[Vector, ...]]
+class Book(eqx.Module):
+    """What one obstacle did to each node in a step, over its mass.
+
+    Attributes:
+        work: change of v^2 / 2 [m^2/s^2].
+        normal: velocity that it gave along its normal [m/s].
+        friction: velocity that it gave along its surface [m/s].
+    """
+
+    work: Array
+    normal: Vector
+    friction: Vector
+
+
+Books = tuple[Book, ...]
 
 
 def strike(
-    floors: tuple[Rule, ...], step: Step, state: State, books: bool = False, is_kicked: bool = True
+    planes: tuple[Plane, ...], step: Step, state: State, books: bool = False, is_kicked: bool = True
 ) -> tuple[State, Status, Books | None]:
-    """The state after the impacts of a step on all these floors, whatever their order, and what went wrong.
+    """The state after the impacts of a step on all these planes, whatever their order, and what went wrong.
 
     Args:
-        floors: all of them.
+        planes: all of them, in the dtype of the state.
         step: what is known of the step.
         state: what the other rules left.
-        books: whether to tell what each floor changed v^2 / 2 and v by, per node: node arrays and `Vector`s.
+        books: whether to tell what each plane did.
         is_kicked: whether another rule may have moved or kicked nodes since the end of motion.
-
-    Raises:
-        TypeError: an obstacle that is no `Floor`.
     """
-    others = [type(f).__name__ for f in floors if not isinstance(f, Floor)]
-    if others:
-        raise TypeError(f"{others[0]} counts as an obstacle, but only Floor can be one.")
     moved = step.moved
-    planes, order = _ordered(tuple(f.plane(moved) for f in floors if isinstance(f, Floor)))
+    planes, order = _ordered(planes)
     scene, path = _begun(planes, step, books)
 
     def met(path: Path) -> tuple[Vector, Vector, Any, Array]:
         path, unfinished = scene.follow(path)
         end, velocity = scene.end(path)
-        position, velocity = _where(path.is_struck, end.position, moved.position), _where(path.is_struck, velocity, moved.velocity)
-        position, velocity = _damped(scene, path, end.held, step, position, velocity)
+        position, velocity = where(path.is_struck, end.position, moved.position), where(path.is_struck, velocity, moved.velocity)
+        basis = scene.basis(end.held)
+        position, velocity = damped(path, step, lambda v: without(v, basis), scene.lifted, position, velocity)
         return position, velocity, (end.work, end.given), unfinished
 
     def passed(path: Path) -> tuple[Vector, Vector, Any, Array]:
@@ -140,7 +167,9 @@ def strike(
     after = state.moved(position, velocity)
     if work is None or given is None:
         return after, status, None
-    return after, status, (tuple(pick(c, work) for c in order), tuple(_pick_vector(c, given) for c in order))
+    rubbed = [v - scene.lever(p.normal, left)[0] * v.dot(p.normal) for p, v, left in zip(planes, given, work, strict=True)]
+    told = [Book(pick(c, work), pick_vector(c, given), pick_vector(c, tuple(rubbed))) for c in order]
+    return after, status, tuple(Book(b.work, b.normal - b.friction, b.friction) for b in told)
 
 
 def _begun(planes: tuple[Plane, ...], step: Step, books: bool) -> tuple[Impacts, Path]:
@@ -186,13 +215,13 @@ def _ordered(planes: tuple[Plane, ...]) -> tuple[tuple[Plane, ...], tuple[tuple[
     if len(planes) == 1:
         return planes, ((jnp.ones((), bool),),)
     keys = [(*p.normal, *p.point, p.restitution, p.friction) for p in planes]
-    places = [sum(_goes_first(k, key, i < j).astype(jnp.int32) for i, k in enumerate(keys) if i != j) for j, key in enumerate(keys)]
+    places = [sum(goes_first(k, key, i < j).astype(jnp.int32) for i, k in enumerate(keys) if i != j) for j, key in enumerate(keys)]
     is_at = [tuple(place == i for place in places) for i in range(len(planes))]
     ordered = tuple(jax.tree.map(lambda *values, c=chosen: pick(c, values), *planes) for chosen in is_at)
     return ordered, tuple(zip(*is_at, strict=True))
 
 
-def _goes_first(a: tuple[Array, ...], b: tuple[Array, ...], otherwise: bool) -> Array:
+def goes_first(a: tuple[Array, ...], b: tuple[Array, ...], otherwise: bool) -> Array:
     """Whether the first number that differs is smaller in `a`; `otherwise` where none does."""
     first, same = jnp.zeros((), bool), jnp.ones((), bool)
     for x, y in zip(a, b, strict=True):
@@ -200,30 +229,41 @@ def _goes_first(a: tuple[Array, ...], b: tuple[Array, ...], otherwise: bool) -> 
     return first | (same & otherwise)
 
 
-def _damped(scene: Impacts, path: Path, held: tuple[Array, ...], step: Step, position: Vector, velocity: Vector) -> tuple[Vector, Vector]:
+def damped(
+    path: Any, step: Step, let: Callable[[Vector], Vector], lifted: Callable[[Vector], Vector], position: Vector, velocity: Vector
+) -> tuple[Vector, Vector]:
     """Positions and velocities with what forces that depend on velocity do otherwise after the impacts.
 
     A change of velocity J with a time r left gives the accelerations F(v + J) - F(v), over mass, for that time: exactly where they are
     linear, whose parts add up; what is beyond that counts for the node itself.
+
+    Args:
+        path: after its impacts.
+        step: what is known of the step.
+        let: takes from a vector what the obstacles do not let through, where nodes rest.
+        lifted: takes positions out of the obstacles.
+        position: at the end of the step [m].
+        velocity: there [m/s].
     """
     if path.first is None or path.moments is None or step.by_velocity is None:
         return position, velocity
     then, impulse, left = path.first
-    at = _where(path.is_struck, then, step.moved.velocity)
+    at = where(path.is_struck, then, step.moved.velocity)
     force, linear = jax.linearize(step.by_velocity, at)
     bend = step.by_velocity(at + impulse) - force - linear(impulse)
-    basis = scene.basis(held)
-    position = position + without(linear(path.moments[1]) + (0.5 * left * left) * bend, basis)
-    velocity = velocity + without(linear(path.moments[0]) + left * bend, basis)
-    return scene.lifted(position), velocity
+    position = position + let(linear(path.moments[1]) + (0.5 * left * left) * bend)
+    velocity = velocity + let(linear(path.moments[0]) + left * bend)
+    return lifted(position), velocity
 
 
-def _where(condition: Array, v: Vector, otherwise: Vector) -> Vector:
+def where(condition: Array, v: Vector, otherwise: Vector) -> Vector:
+    """`v` where the condition holds."""
     return v.map(lambda a, b: jnp.where(condition, a, b), otherwise)
 
 
-def _pick_vector(chosen: tuple[Array, ...], values: tuple[Vector, ...]) -> Vector:
+def pick_vector(chosen: tuple[Array, ...], values: tuple[Vector, ...]) -> Vector:
+    """The vector of the chosen obstacle."""
     return Vector(tuple(pick(chosen, parts) for parts in zip(*values, strict=True)))
 
 
-__all__ = ["Books", "Floor", "strike"]
+__all__ = ["Book", "Books", "Floor", "coefficients", "damped", "goes_first", "pick_vector", "refused", "strike", "where"]

@@ -137,11 +137,15 @@ class NeighbourList(Pairs):
         """Sum over the listed pairs; over all pairs where the list cannot be trusted."""
         return lax.cond(
             any_lane(~memory.is_trusted),
-            lambda fields, near: AllPairs().visit(function, fields),
+            lambda fields, near: self.everyone().visit(function, fields),
             lambda fields, near: _sum_listed(function, fields, near, memory.dim),
             fields,
             memory.near,
         )
+
+    def everyone(self) -> AllPairs:
+        """All pairs, which are summed where the list cannot be trusted."""
+        return AllPairs()
 
     def _made(self, position: Fields, reach: Array | None, rebuilds: Array, box: Array | None) -> NeighbourMemory:
         edge = self._edge(position, reach)

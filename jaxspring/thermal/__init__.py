@@ -23,6 +23,7 @@ if TYPE_CHECKING:  # written by `python -m tests.face`
     from .fusing import melted_fraction as melted_fraction
     from .heat import total_heat as total_heat
     from .hot_plane import HotPlane as HotPlane
+    from .hot_plane import HotSurface as HotSurface
     from .latent import LatentHeat as LatentHeat
     from .ledger import Account as Account
     from .schemes import BackwardEulerHeat as BackwardEulerHeat

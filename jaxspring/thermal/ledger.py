@@ -127,10 +127,9 @@ class Ledger(Rule):
 
     def _by_obstacle(self, state: State, struck: Books, books: Array, motion: Array, momenta: Array) -> tuple[Array, Array, Array]:
         """The entries, where what each obstacle took of energy and gave of momentum is its own and no longer motion's."""
-        mass, (work, given) = self._mass(state), struck
-        rows = [i for i, rule in enumerate(self._parts()[1]) if rule.is_obstacle]
-        for i, taken, velocity in zip(rows, work, given, strict=True):
-            energy, momentum = jnp.sum(mass * taken), jnp.stack([jnp.sum(mass * a) for a in velocity])
+        mass, rows = self._mass(state), [i for i, rule in enumerate(self._parts()[1]) if rule.is_obstacle]
+        for i, book in zip(rows, struck, strict=True):
+            energy, momentum = jnp.sum(mass * book.work), jnp.stack([jnp.sum(mass * a) for a in book.normal + book.friction])
             books, motion = books.at[i, 0].add(energy), motion.at[0].add(-energy)
             momenta = momenta.at[1 + i].add(momentum).at[0].add(-momentum)
         return books, motion, momenta

@@ -1,0 +1,90 @@
+"""When a node on its way through a step first meets an obstacle.
+
+The distance cannot fall faster than the node and the obstacle approach each other, V: from a distance d nothing is met for the time d / V.
+The search goes by such times, or by a 64th of what is left where they are shorter. Where the distance falls at one end of an interval
+and rises at the other, it is looked at between them too, where the two tangents cross: near the lowest point. The first interval in
+which it becomes negative holds the root, which Newton's method finds, kept between bounds.
+
+Source: marching by distances as in Hart (1996), "Sphere tracing"; Newton's method with bisection as in Press and others, Numerical
+Recipes (2007), 9.4.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from ..numerics import tiny
+
+SHORTEST = 64  # intervals in what is left of a step, at most
+ITERATIONS = 60  # of Newton's method: a bisection alone would need as many as a number has digits
+
+
+class _March(NamedTuple):
+    """Where the search stands: time, distance there and its slope, the interval of the root, whether it is found, whether it goes on."""
+
+    s: Array
+    value: Array
+    slope: Array
+    low: Array
+    high: Array
+    is_found: Array
+    is_open: Array
+
+
+def first_root(
+    distance: Callable[[Array], tuple[Array, Array]], begin: Array, end: Array, speed: Array, rounding: Array, is_wanted: Array
+) -> tuple[Array, Array]:
+    """First time between 0 and `end` at which the distance of each node becomes negative [s], and whether there is one.
+
+    Args:
+        distance: times -> distances [m] and their slopes [m/s].
+        begin: up to here none is met, unless the distance is negative here.
+        end: [s].
+        speed: V [m/s].
+        rounding: a distance that is negative by less is rounding [m].
+        is_wanted: which nodes are looked at.
+    """
+    least, speed = end / SHORTEST, jnp.maximum(speed, tiny(speed.dtype))
+    value, slope = distance(begin)
+    is_passed = is_wanted & (value < -rounding)
+    start = _March(begin, value, slope, jnp.zeros_like(begin), begin, is_passed, is_wanted & ~is_passed & (begin < end))
+
+    def further(at: _March) -> _March:
+        s = jnp.minimum(at.s + jnp.maximum(at.value / speed, least), end)
+        value, slope = distance(s)
+        turns = (at.slope < 0) & (slope > 0)
+        steps = jnp.where(turns, at.slope - slope, -jnp.ones_like(slope))
+        lowest = jnp.where(turns, jnp.clip(at.s + (value - at.value - slope * (s - at.s)) / steps, at.s, s), s)
+        dips = distance(lowest)[0] < -rounding
+        is_in = at.is_open & (dips | (value < -rounding))
+        high = jnp.where(dips, lowest, s)
+        low, high = (jnp.where(is_in, new, old) for new, old in ((at.s, at.low), (high, at.high)))
+        return _March(s, value, slope, low, high, at.is_found | is_in, at.is_open & ~is_in & (s < end))
+
+    found = lax.while_loop(lambda at: jnp.any(at.is_open), further, start)
+    return _polished(distance, found), found.is_found
+
+
+def _polished(distance: Callable[[Array], tuple[Array, Array]], found: _March) -> Array:
+    """The root in the interval that was found."""
+
+    def newton(at: tuple[Array, Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array, Array]:
+        s, low, high, is_open, count = at
+        value, slope = distance(s)
+        low, high = jnp.where(value >= 0, s, low), jnp.where(value < 0, s, high)
+        ahead = s - value / jnp.where(slope == 0, jnp.ones_like(slope), slope)
+        is_between = (ahead >= low) & (ahead <= high) & (slope != 0)
+        new = jnp.where(is_between, ahead, 0.5 * (low + high))
+        enough = 2 * float(jnp.finfo(s.dtype).eps) * high
+        return jnp.where(is_open, new, s), low, high, is_open & (jnp.abs(new - s) > enough), count + 1
+
+    start = (0.5 * (found.low + found.high), found.low, found.high, found.is_found, jnp.zeros((), jnp.int32))
+    return lax.while_loop(lambda at: jnp.any(at[3]) & (at[4] < ITERATIONS), newton, start)[0]
+
+
+__all__ = ["first_root"]

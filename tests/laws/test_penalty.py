@@ -95,6 +95,7 @@ def test_force_and_matrices_are_derivatives(name):
         np.testing.assert_allclose(across @ clamped @ across, positive, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_at_rest_as_deep_as_the_load_asks():
     """In `equilibrium` a weight stands at m g / k + w / 2 below the surface, and at the top of a ball too; its derivatives are those of the
     formula, and -1 by the radius. The dt of one node alone is 2 sqrt(m / k).
@@ -159,7 +160,7 @@ def slide(friction, creep=1e-3):
 def test_a_block_on_an_incline():
     """It creeps slower than `creep` where tan a <= mu; else it slides with g (sin a - mu cos a): the cone of Coulomb."""
     mu = np.array([0.0, 0.2, 0.35, 0.40, 1.0])  # tan 20 degrees is 0.364
-    speed, status = jax.jit(jax.vmap(slide))(mu)
+    speed, _ = jax.jit(jax.vmap(slide))(mu)
     a = np.radians(20.0)
     np.testing.assert_allclose(speed[:3], 0.5 * 10 * (np.sin(a) - mu[:3] * np.cos(a)), rtol=1e-3, atol=1e-3)
     assert (np.abs(speed[3:]) < 1e-3).all()
@@ -195,6 +196,7 @@ def draped(radius, stiffness, stepper, dt, n_steps):
     return jnp.mean(run.state.position.y), run.status
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stepper", [js.VelocityVerlet(), js.BackwardEuler()], ids=lambda s: type(s).__name__)
 def test_derivatives_of_a_run(stepper):
     """Through explicit and implicit steps the derivative by radius and stiffness is that of central differences; `vmap` gives each lane's
@@ -221,6 +223,7 @@ def test_derivatives_of_a_run(stepper):
     np.testing.assert_allclose(by_stiffness[0], (z[3] - z[4]) / (800 * h), rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_in_diffrax_as_in_rollout():
     """`diffeqsolve` with tight tolerances ends where small steps of Runge and Kutta do."""
     ground = c.Penalty(c.Sphere((0.0, -1.0), 1.0), 500.0, 3.0, 0.4, onset=0.05, creep=0.2)

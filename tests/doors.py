@@ -241,16 +241,15 @@ MADE_INSIDE = """
 NO_ARRAYS = """
     AllPairs Adam BDF2 BackwardEuler BackwardEulerHeat Bilinear BlockJacobi Bounded CG Cells Channel Checkpoint CheckpointError
     Checkpointed ConstantsSettings CrankNicolsonHeat CubicSpline Curvature Cutoff EnergyLaw EqualCells ExactSolver ExactTangent
-    ExpansionRule ExplicitHeat Flag Force ForwardEuler GradientMagnitude GradientWarning HalfCells HeatIteration HeatScheme HeightField Hooke
-    Identity ImageError ImplicitMidpoint Intensity Jacobi JaxCG LBFGS Lattice Law LeastSquares Ledger LinearSolver Linearisation
-    Lineax Luminance Molten Moving Multigrid Natural Newton NoCutoff Observation Obstacle Optax Optimiser Ordering PairLaw Pairs Positive PowerLaw
-    Preconditioner Progress PullLaw Reconstruction Relaxation ReverseCuthillMcKee Rule RungeKutta4 Sampling Secant SemiImplicit
-    SignedDistance SimulationError Skyline SoftPositive SplitHeat SpringSettings StabilityWarning Stepper StiffnessRule Still Stop StopReason
-    StoreAll StoreStates SymmetricSplitHeat SymplecticEuler Tangent TensionOnly ThermalBoundary Topology Transform Unpreconditioned
-    VelocityVerlet animate batch domain elevation_model
-    energy_ledger equilibrium fit_constants fit_springs from_mesh gradient_magnitude load
-    load_image melted_fraction normal_modes principal_curvatures raise_for_status save save_trajectory select smoothing_radius
-    stable_dt total_heat
+    ExpansionRule ExplicitHeat Flag Force ForwardEuler GradientMagnitude GradientWarning HalfCells HeatIteration HeatScheme
+    HeightField Hooke Identity ImageError ImplicitMidpoint Intensity Jacobi JaxCG LBFGS Lattice Law LeastSquares Ledger LinearSolver
+    Linearisation Lineax Luminance Molten Moving Multigrid Natural Newton NoCutoff Observation Obstacle Optax Optimiser Ordering
+    PairLaw Pairs Positive PowerLaw Preconditioner Progress PullLaw Reconstruction Relaxation ReverseCuthillMcKee Rule RungeKutta4
+    Sampling Secant SemiImplicit SignedDistance SimulationError Skyline SoftPositive SplitHeat SpringSettings StabilityWarning Stepper
+    StiffnessRule Still Stop StopReason StoreAll StoreStates SymmetricSplitHeat SymplecticEuler Tangent TensionOnly ThermalBoundary
+    Topology Transform Unpreconditioned VelocityVerlet animate batch domain elevation_model energy_ledger equilibrium fit_constants
+    fit_springs from_mesh gradient_magnitude load load_image melted_fraction normal_modes principal_curvatures raise_for_status save
+    save_trajectory select smoothing_radius stable_dt total_heat
 """
 
 

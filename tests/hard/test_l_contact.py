@@ -17,7 +17,7 @@ def two_sheets(gap):
     sheet = js.lattice((n, n), js.STRUCTURAL + js.SHEAR)
     edges = np.concatenate([sheet.edges, sheet.edges + n * n])
     flat = np.c_[sheet.grid(1.0), np.zeros(n * n)]
-    return js.Graph.from_edges(edges, 2 * n * n), np.concatenate([flat, flat + [0.1, 0.05, gap]])
+    return js.Graph.from_edges(edges, 2 * n * n), np.concatenate([flat, flat + np.array([0.1, 0.05, gap])])
 
 
 @pytest.mark.slow

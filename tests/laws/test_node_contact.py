@@ -112,8 +112,8 @@ def met(start, velocity, angle):
 
 
 def test_head_on_two_nodes_exchange_their_velocities():
-    """Of equal masses, without damper, on a line and as discs in the plane: the velocities exchange, momentum stays to rounding and energy to
-    the stepper's order, and the derivative of each end by the other's start is 1.
+    """Of equal masses, without damper, on a line and as discs in the plane: the velocities exchange, momentum stays to rounding and energy
+    to the stepper's order, and the derivative of each end by the other's start is 1.
     """
     start, velocity = jnp.array([0.0, 2.0]), jnp.array([1.0, -0.5])
     slopes, (after, whole, energy, status) = jax.jit(jax.vmap(jax.jacrev(met, has_aux=True), in_axes=(None, None, 0)))(
@@ -127,7 +127,7 @@ def test_head_on_two_nodes_exchange_their_velocities():
 
 
 def test_a_glancing_blow():
-    """Two discs of equal mass, one at rest: they part at right angles where no energy is lost, and with friction and damper momentum is kept
+    """Two discs of equal mass, one at rest: they part at right angles where no energy is lost; with friction and damper momentum is kept
     while energy falls.
     """
     start = js.State.from_points(FREE, [[0.0, 0.0], [1.0, 0.2]], [[1.0, 0.0], [0.0, 0.0]])

@@ -139,7 +139,7 @@ def test_a_bounce():
         return (*bounce(k, damping, onset, dt, n, js.VelocityVerlet()), of_height(jnp.asarray(0.1))[1])
 
     ratio = np.array([0.0, 0.1, 0.3])
-    y, v, status, slope = all_of(2 * ratio * np.sqrt(k), np.array([5e-3, 2e-4, 2e-4]))
+    _, v, status, slope = all_of(2 * ratio * np.sqrt(k), np.array([5e-3, 2e-4, 2e-4]))
     assert (np.asarray(status.flags) == 0).all()
     np.testing.assert_allclose(v[0], 1.0, rtol=1e-6)
     np.testing.assert_allclose(slope[0], -1.0, rtol=1e-3)

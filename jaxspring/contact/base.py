@@ -60,7 +60,7 @@ class Obstacle(eqx.Module):
 
     @property
     def is_flat(self) -> bool:
-        """Whether its surface has no curvature anywhere."""
+        """Whether the distance is linear, piece by piece, wherever it is not positive: contact then feels no bend of the surface."""
         return False
 
     def invalid(self) -> Array | None:

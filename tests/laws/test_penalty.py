@@ -146,6 +146,38 @@ def test_a_bounce():
     np.testing.assert_allclose(v[1:], np.exp(-np.pi * ratio / np.sqrt(1 - ratio**2))[1:], rtol=2e-2)
 
 
+def test_implicit_steps_far_above_the_limit():
+    """Newton's backward Euler at eight times the explicit limit: a ball that falls comes to rest where its weight asks, with no
+    alarm.
+    """
+    k = 1e5
+    system = js.System(ONE, 1.0, (c.Penalty(c.Plane(GROUND, UP), k, onset=1e-4), js.Gravity((0.0, -10.0))))
+    start = js.State.from_points(ONE, [[0.0, 0.1]])
+    assert js.stable_dt(system, start) < 0.05 / 7.9
+    run = js.rollout(system, start, js.BackwardEuler(newton=True), 0.05, 80)
+    assert int(run.status.flags) == 0
+    np.testing.assert_allclose(run.state.position.y, -(10 / k + 5e-5), rtol=1e-6)
+    np.testing.assert_allclose(run.state.velocity.y, 0, atol=1e-6)
+
+
+def test_energy_never_rises():
+    """Of 30 balls thrown at a disc in every way, with damper and friction, none has more energy later than earlier."""
+    net = js.Graph.from_edges(np.zeros((0, 2), int), 1)
+    ground = c.Penalty(c.Sphere((0.0, 0.0), 1.0), 800.0, 6.0, 0.5, 0.02, 0.1)
+    system = js.System(net, 1.0, ground)
+    rng = np.random.default_rng(5)
+
+    def energies(x, v):
+        run = js.rollout(system, js.State.from_points(net, x[None], v[None]), js.VelocityVerlet(), 5e-4, 2000, save_every=20)
+        return jax.vmap(lambda state: system.energy(state).total)(run.saved)
+
+    angle = rng.uniform(0, 2 * np.pi, 30)
+    x = 1.05 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    found = np.asarray(jax.jit(jax.vmap(energies))(x, -3 * x + rng.normal(size=(30, 2))))
+    assert (found[:, -1] < 0.9 * found[:, 0]).sum() > 20
+    assert np.diff(found, axis=1).max() < 1e-6 * found.max()
+
+
 def slide(friction, creep=1e-3):
     """Speed along a slope of 20 degrees after 0.5 s, from rest."""
     slope = np.radians(20.0)

@@ -229,19 +229,16 @@ def draped(radius, stiffness, stepper, dt, n_steps):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stepper", [js.VelocityVerlet(), js.BackwardEuler()], ids=lambda s: type(s).__name__)
-def test_derivatives_of_a_run(stepper):
-    """Through explicit and implicit steps the derivative by radius and stiffness is that of central differences; `vmap` gives each lane's
-    own; the obstacle is an argument of one compiled program.
+def test_derivatives_of_a_run():
+    """Through implicit steps of one linear solve, damper and friction and the bend of a disc in the matrix, the derivative by radius and
+    stiffness is that of central differences; `vmap` gives each lane's own; the obstacle is an argument of one compiled program.
     """
-    long = isinstance(stepper, js.BackwardEuler)
-    dt, n = (4e-3, 75) if long else (1e-3, 300)
     n_traces = 0
 
     def height(radius, stiffness):
         nonlocal n_traces
         n_traces += 1
-        return draped(radius, stiffness, stepper, dt, n)[0]
+        return draped(radius, stiffness, js.BackwardEuler(), 4e-3, 75)[0]
 
     both = jax.jit(jax.vmap(jax.value_and_grad(height, argnums=(0, 1))))
     h = 1e-5
@@ -288,13 +285,12 @@ def test_bad_constants_are_refused_by_name(kind, match, build):
         build()
 
 
-def test_constants_that_went_bad_later_fail_the_run():
-    """A radius that turned negative, a stiffness that is NaN: the status of the run says INVALID and names the part."""
+def test_constants_that_went_bad_later_are_invalid():
+    """A radius that turned negative, a stiffness that is NaN, an onset of zero: `invalid` tells, as every run asks before it starts."""
     good = c.Penalty(c.Sphere((0.0, -1.0), 1.0), 500.0)
-    start = js.State.from_points(ONE, [[0.1, 0.2]])
+    assert not bool(good.invalid())
     for where, value in ((lambda p: p.obstacle.radius, -1.0), (lambda p: p.law.stiffness, jnp.nan), (lambda p: p.law.onset, 0.0)):
-        system = js.System(ONE, 1.0, eqx.tree_at(where, good, jnp.asarray(value)))
-        assert bool(js.rollout(system, start, js.VelocityVerlet(), 1e-3, 1).status.has(js.Flag.INVALID))
+        assert bool(eqx.tree_at(where, good, jnp.asarray(value)).invalid())
 
 
 def test_replace_reaches_every_constant():

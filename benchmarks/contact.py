@@ -62,7 +62,7 @@ def obstacles(size: float) -> dict[str, js.contact.Obstacle]:
         "capsule": c.Capsule((-big, middle[1], -big), (big, middle[1], -big), big),
         "cylinder": c.Cylinder((-big, middle[1], -big), (big, middle[1], -big), big),
         "height field": c.HeightField(js.Image(0.01 * np.sin(9 * x) * np.cos(7 * y), spacing=size / 31)),
-        "mesh": c.MeshField(vertices * size * 3 + [*middle, -3 * size], faces, size / 4),
+        "mesh": c.MeshField(vertices * size * 3 + [*middle, -2.95 * size], faces, size / 4),
         "moving plane": c.Moving(c.Plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)), lambda t: jnp.stack([t, t * 0, t * 0])),
     }
 
@@ -89,7 +89,15 @@ def force_error(force: js.Force | None, net: js.Lattice, points: np.ndarray) -> 
         with jax.enable_x64(wide):
             part = jax.tree.map(lambda a: a.astype(float) if eqx.is_inexact_array(a) else a, force) if wide else force
             system = js.System(net, 1.0, part)
-            ends.append(np.stack([np.asarray(net.flatten_nodes(a)) for a in system.force(js.State.from_points(net, points))], axis=-1))
+            ends.append(
+                np.stack(
+                    [
+                        np.asarray(net.flatten_nodes(a))
+                        for a in system.force(js.State.from_points(net, points.astype(float) if wide else points))
+                    ],
+                    axis=-1,
+                )
+            )
     largest = np.abs(ends[1]).max()
     return (float(np.abs(ends[0] - ends[1]).max() / largest) if largest else 0.0, float((np.abs(ends[1]).max(axis=1) > 0).mean()))
 

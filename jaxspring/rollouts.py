@@ -171,8 +171,8 @@ def _warn(result: Result, dt: Array) -> None:
         else:
             text = (
                 f"dt = {float(dt):.6g} s was below stable_dt at the start, but later the limit fell below it (`result.status` says where): "
-                f"particles moved or met too fast, farther in a step than half the list's skin or for the fluid's collision_dt, or a "
-                f"node became too hot. Lower dt, or widen the skin"
+                f"particles moved or met too fast, farther in a step than half the list's skin or a node's radius or for the fluid's "
+                f"collision_dt, or a node became too hot. Lower dt, or widen the skin"
             )
         warnings.warn(f"DT_LIMIT: {text}.", StabilityWarning, stacklevel=3)
     # A run that failed has grown too large as well, but that is not what was wrong.

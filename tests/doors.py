@@ -74,6 +74,8 @@ def number(value: float) -> np.ndarray:
 
 
 DOORS: dict[str, Door] = {
+    "Box": Door(js.contact.Box, {"centre": np.array([0.0, 1.0]), "half_sizes": np.array([1.0, 2.0])}),
+    "Capsule": Door(js.contact.Capsule, {"a": np.array([0.0, 1.0]), "b": np.array([1.0, 2.0]), "radius": number(0.5)}),
     "Combined": Door(
         lambda weights: js.images.Combined((js.images.Intensity(), js.images.Curvature()), weights), {"weights": np.array([1.0, 2.0])}
     ),
@@ -84,6 +86,7 @@ DOORS: dict[str, Door] = {
         lambda **a: js.thermal.Convection(net(), **a),
         {"nodes": PATTERN, "coefficient": per_node(), "ambient": per_node(280), "area": per_node()},
     ),
+    "Cylinder": Door(js.contact.Cylinder, {"a": np.array([0.0, 1.0]), "b": np.array([1.0, 2.0]), "radius": number(0.5)}),
     "Dashpots": Door(lambda damping: js.Dashpots(net(), damping), {"damping": per_spring()}),
     "DataSprings": Door(lambda stiffness: js.DataSprings(image(), stiffness), {"stiffness": per_node()}),
     "Drag": Door(js.Drag, {"gamma": per_node()}),
@@ -101,6 +104,7 @@ DOORS: dict[str, Door] = {
         on_host=("edges", "triangles"),
     ),
     "Gravity": Door(js.Gravity, {"acceleration": np.array([0.0, -9.5]), "mass": per_node()}),
+    "HalfSpaces": Door(js.contact.HalfSpaces, {"points": np.zeros((2, 2)), "normals": np.array([[0.0, 1.0], [2.0, 0.0]])}),
     "Heat": Door(lambda **a: js.Heat(net(), **a), {"capacity": per_node(), "conductance": per_spring(), "source": per_node()}),
     "HeatFlux": Door(lambda **a: js.thermal.HeatFlux(net(), **a), {"nodes": PATTERN, "flux": per_node(), "area": per_node()}),
     "HotPlane": Door(
@@ -108,6 +112,16 @@ DOORS: dict[str, Door] = {
         {
             "point": np.array([0.0, 1.0]),
             "normal": np.array([0.0, 2.0]),
+            "temperature": number(400.0),
+            "coefficient": number(3.0),
+            "area": per_node(),
+            "reach": number(0.5),
+            "fade": number(0.25),
+        },
+    ),
+    "HotSurface": Door(
+        lambda **a: js.thermal.HotSurface(js.contact.Sphere((0.0, 0.0), 1.0), **a),
+        {
             "temperature": number(400.0),
             "coefficient": number(3.0),
             "area": per_node(),
@@ -123,10 +137,42 @@ DOORS: dict[str, Door] = {
     "LatentHeat": Door(js.thermal.LatentHeat, {"melting": per_node(350), "latent": per_node()}),
     "LennardJones": Door(js.fluid.LennardJones, {"epsilon": number(2.0), "sigma": number(0.5)}),
     "Load": Door(lambda forces: js.Load.from_points(net(), forces), {"forces": np.arange(8.0).reshape(N, 2)}),
+    "MeshField": Door(
+        js.contact.MeshField,
+        {
+            "vertices": np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]),
+            "faces": np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]),
+            "spacing": number(0.5),
+        },
+        on_host=("vertices", "faces", "spacing"),
+    ),
     "Motion": Door(lambda moved: js.Motion(moved, lambda t: js.Vector((t,))), {"moved": PATTERN}),
     "NeighbourList": Door(lambda skin: js.fluid.NeighbourList(8, skin), {"skin": number(0.5)}),
+    "NodeContact": Door(
+        lambda **a: js.contact.NodeContact(net(), **a),
+        {
+            "radius": per_node(),
+            "stiffness": number(2.0),
+            "damping": number(0.5),
+            "friction": number(0.25),
+            "onset": number(0.125),
+            "creep": number(0.5),
+            "rest": np.arange(8.0).reshape(N, 2),
+        },
+    ),
     "PairDrag": Door(js.fluid.PairDrag, {"damping": number(2.0), "radius": number(1.5)}),
+    "Penalty": Door(
+        lambda **a: js.contact.Penalty(js.contact.Sphere((0.0, 0.0), 1.0), **a),
+        {
+            "stiffness": per_node(),
+            "damping": per_node(),
+            "friction": per_node(),
+            "onset": number(0.125),
+            "creep": number(0.5),
+        },
+    ),
     "PixelSprings": Door(lambda stiffness: js.reconstruction.PixelSprings(cast(Any, None), stiffness), {"stiffness": number(2.0)}),
+    "Plane": Door(js.contact.Plane, {"point": np.array([0.0, 1.0]), "normal": np.array([0.0, 2.0])}),
     "PlainCutoff": Door(js.fluid.PlainCutoff, {"radius": number(2.5)}),
     "Radiation": Door(
         lambda **a: js.thermal.Radiation(net(), **a),
@@ -136,6 +182,7 @@ DOORS: dict[str, Door] = {
     "Refreezing": Door(js.thermal.Refreezing, {"hysteresis": number(5.0), "reach": number(1.5)}),
     "ShiftedForce": Door(js.fluid.ShiftedForce, {"radius": number(2.5)}),
     "SlideLaw": Door(js.fluid.SlideLaw, {"alpha": number(1.0), "beta": number(2.0), "zeta": number(0.5)}),
+    "Sphere": Door(js.contact.Sphere, {"centre": np.array([0.0, 1.0]), "radius": number(0.5)}),
     "Springs": Door(lambda **a: js.Springs(net(), **a), {"stiffness": per_spring(), "rest_length": per_spring(0.5)}),
     "State": Door(
         lambda **a: js.State.from_points(net(), **a),
@@ -201,16 +248,17 @@ MADE_INSIDE = """
 NO_ARRAYS = """
     AllPairs Adam BDF2 BackwardEuler BackwardEulerHeat Bilinear BlockJacobi Bounded CG Cells Channel Checkpoint CheckpointError
     Checkpointed ConstantsSettings CrankNicolsonHeat CubicSpline Curvature Cutoff EnergyLaw EqualCells ExactSolver ExactTangent
-    ExpansionRule ExplicitHeat Flag Force ForwardEuler GradientMagnitude GradientWarning HalfCells HeatIteration HeatScheme Hooke
-    Identity ImageError ImplicitMidpoint Impulses Intensity Jacobi JaxCG LBFGS Lattice Law LeastSquares Ledger LinearSolver Linearisation
-    Lineax Luminance Molten Multigrid Natural Newton NoCutoff Observation Optax Optimiser Ordering PairLaw Pairs Positive PowerLaw
-    Preconditioner Progress PullLaw Reconstruction Relaxation ReverseCuthillMcKee Rule RungeKutta4 Sampling Secant SemiImplicit
-    SimulationError Skyline SoftPositive SplitHeat SpringSettings StabilityWarning Stepper StiffnessRule Still Stop StopReason
-    StoreAll StoreStates SymmetricSplitHeat SymplecticEuler Tangent TensionOnly ThermalBoundary Topology Transform Unpreconditioned
-    VelocityVerlet animate batch domain elevation_model energy_ledger equilibrium fit_constants fit_springs from_mesh
-    gradient_magnitude impulses load load_image melted_fraction normal_modes pad_nets principal_curvatures push_out
-    raise_for_status save save_trajectory select smoothing_radius
-    stable_dt total_heat
+    ExpansionRule ExplicitHeat Flag Force ForwardEuler GradientMagnitude GradientWarning HalfCells HeatIteration
+    HeatScheme HeightField Hooke Identity ImageError ImplicitMidpoint Impulses Intensity Jacobi JaxCG LBFGS Lattice Law
+    LeastSquares Ledger LinearSolver Linearisation Lineax Luminance Molten Moving Multigrid Natural Newton NoCutoff
+    Observation Obstacle Optax Optimiser Ordering PairLaw Pairs Positive PowerLaw Preconditioner Progress PullLaw
+    Reconstruction Relaxation ReverseCuthillMcKee Rule RungeKutta4 Sampling Secant SemiImplicit SignedDistance
+    SimulationError Skyline SoftPositive SplitHeat SpringSettings StabilityWarning Stepper StiffnessRule Still Stop
+    StopReason StoreAll StoreStates SymmetricSplitHeat SymplecticEuler Tangent TensionOnly ThermalBoundary Topology
+    Transform Unpreconditioned VelocityVerlet animate batch domain elevation_model energy_ledger equilibrium
+    fit_constants fit_springs from_mesh gradient_magnitude impulses load load_image melted_fraction normal_modes
+    pad_nets principal_curvatures push_out raise_for_status save save_trajectory select smoothing_radius stable_dt
+    total_heat
 """
 
 

@@ -5,8 +5,8 @@
     -d_t n / |n|**2      [m/s]  how fast the surface moves along its normal, where d_t is the rate of d at a fixed place
 
 Contact, heat and whatever else meets obstacles asks for nothing but these. The distance is differentiable in place, time and every
-constant: a radius, a centre or the height of a ground may be fitted. Where it has a kink (a centre, an edge, the middle of a box) its derivative is
-that of one side, finite, and zero where no side is nearer than another.
+constant: a radius, a centre or the height of a ground may be fitted. Where it has a kink (a centre, an edge, the middle of a box) its
+derivative is that of one side, finite, and zero where no side is nearer than another.
 
 Source: Osher and Fedkiw (2003), Level Set Methods and Dynamic Implicit Surfaces, chapter 2.
 """
@@ -60,7 +60,7 @@ class Obstacle(eqx.Module):
 
     @property
     def is_flat(self) -> bool:
-        """Whether its surface has no curvature anywhere."""
+        """Whether the distance is linear, piece by piece, wherever it is not positive: contact then feels no bend of the surface."""
         return False
 
     def invalid(self) -> Array | None:

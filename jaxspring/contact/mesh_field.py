@@ -120,8 +120,9 @@ def _checked(vertices: Any, faces: Any) -> tuple[np.ndarray, np.ndarray]:
     points = given("vertices", vertices)
     if isinstance(points, Tracer):
         raise TypeError("vertices is traced (made inside jit, grad or vmap), but a mesh is sampled on the host. Build it outside.")
-    points = np.asarray(as_inexact("vertices", vertices), float)
-    finite("vertices", points)
+    finite("vertices", as_inexact("vertices", points))
+    # In float64, whatever the library's type is: distances are differences of large coordinates.
+    points = np.asarray(points, np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or not len(points):
         raise ValueError(f"vertices has shape {points.shape}; expected (V, 3), three coordinates for each vertex.")
     triangles = triangle_indices("faces", faces, len(points))

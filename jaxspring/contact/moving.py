@@ -82,7 +82,7 @@ class Moving(Obstacle):
 
     @property
     def is_flat(self) -> bool:
-        """Whether what moves has no curvature."""
+        """Whether the surface of what moves has no bend."""
         return self.obstacle.is_flat
 
     def invalid(self) -> Array | None:

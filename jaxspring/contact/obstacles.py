@@ -60,7 +60,7 @@ class Plane(Obstacle):
 
     @property
     def is_flat(self) -> bool:
-        """Whether its surface has no curvature: a plane has none."""
+        """Whether the surface has no bend: a plane has none."""
         return True
 
     def invalid(self) -> Array:
@@ -113,7 +113,7 @@ class HalfSpaces(Obstacle):
 
     @property
     def is_flat(self) -> bool:
-        """Whether its surface has no curvature: planes have none."""
+        """Whether the surface has no bend: planes have none."""
         return True
 
     def invalid(self) -> Array:
@@ -179,6 +179,11 @@ class Box(Obstacle):
     def check(self, dim: int) -> None:
         """Raise ValueError where the space has another number of coordinates."""
         check_dim("box", self.centre.shape[0], dim)
+
+    @property
+    def is_flat(self) -> bool:
+        """Whether the surface has no bend: inside a box the distance is that to a face."""
+        return True
 
     def invalid(self) -> Array:
         """Whether a half size is not positive, or a number not finite."""

@@ -13,6 +13,7 @@ Source: soft balls as in Cundall and Strack (1979), "A discrete numerical model 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
@@ -22,7 +23,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .._arrays import Numbers
-from .._checks import as_inexact, finite, is_concrete, kind, node_values, nonnegative
+from .._checks import as_inexact, finite, has_shape, is_concrete, kind, node_values, nonnegative
 from ..forces.base import Finding, Force, Scene, Step, any_refused
 from ..forces.neighbour_list import NeighbourList
 from ..forces.pair_sums import Fields
@@ -110,6 +111,8 @@ class NodeContact(Force):
                 raise ValueError(f"{name} has shape {value.shape}; expected one number: a pair has two nodes. Give radii per node.")
         self.rest = None if rest is None else as_inexact("rest", rest)
         if self.rest is not None:
+            n = math.prod(self.joined.layout.shape)
+            has_shape("rest", self.rest, {f"{dim} coordinates per node": (n, dim) for dim in (1, 2, 3)})
             finite("rest", self.rest)
         chosen = AllPairs() if pairs is None else kind("pairs", pairs, Pairs, "NeighbourList(capacity=32, skin=0.05)")
         if not isinstance(chosen, AllPairs | NeighbourList):

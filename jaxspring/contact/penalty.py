@@ -49,9 +49,9 @@ class Penalty(Force):
         ValueError: a negative constant, an onset or a creep that is not positive.
 
     >>> net = js.lattice(1)
-    >>> ground = Penalty(js.contact.Plane((0.0, 0.0), (0.0, 1.0)), stiffness=1000.0, onset=0.01)
-    >>> system = js.System(net, mass=1.0, forces=(ground, js.Gravity((0.0, -10.0))))
-    >>> at_rest = js.equilibrium(system, js.State.from_points(net, [[0.0, 0.0]]), preconditioner=js.linalg.Jacobi())
+    >>> ground = Penalty(js.contact.Plane((0.0,), (1.0,)), stiffness=1000.0, onset=0.01)
+    >>> system = js.System(net, mass=1.0, forces=(ground, js.Gravity((-10.0,))))
+    >>> at_rest = js.equilibrium(system, js.State.from_points(net, [[0.0]]))
     >>> print(ground.depth(at_rest.state).round(5))
     [0.015]
     """
@@ -132,7 +132,7 @@ class Penalty(Force):
         """k p' n n' - k p hess d [N/m], the second part clamped where asked; damper and friction change with the place: left out."""
         law, d, normal, _ = self._seen(state)
         stiff = Blocks(dyads=(NodeDyads(jnp.broadcast_to(law.stiffness * law.slope(-d), d.shape), normal),))
-        if self.obstacle.is_flat or state.dim == 1:
+        if self.obstacle.is_flat:
             return stiff
         # Each computed once: without the barrier XLA would write every chain of operations anew wherever an entry is read.
         hessian, normal, d = lax.optimization_barrier((curvature(self.obstacle, state.position, state.time), normal, d))
@@ -158,7 +158,7 @@ class Penalty(Force):
         law, d, normal, _ = self._seen(state)
         squared = normal.dot(normal)
         bound = law.stiffness * jnp.where(squared > 1, squared, jnp.ones_like(squared))
-        if self.obstacle.is_flat or state.dim == 1:
+        if self.obstacle.is_flat:
             return bound
         rows = curvature(self.obstacle, state.position, state.time)
         size = jnp.sqrt(sum((row.dot(row) for row in rows), start=jnp.zeros_like(d)))

@@ -1,6 +1,8 @@
 """What the compiled programs hold: no scatter, and only the operations that the scene names. Read from their StableHLO."""
 
 import re
+import subprocess
+import sys
 from collections import Counter
 
 import equinox as eqx
@@ -12,6 +14,7 @@ from jax import lax
 
 import jaxspring as js
 from jaxspring.images import Image
+from tests import source
 
 SHEET = js.lattice((5, 6), js.STRUCTURAL + js.SHEAR + js.BEND)
 GRAPH = js.Graph.from_edges(SHEET.edges[::-1], 30)
@@ -200,6 +203,36 @@ def test_an_image_adds_its_own_operations():
     assert alone["gather"] == 4  # the corners of a cell
     assert "scatter" not in alone
     assert with_image == plain + alone + Counter(add=3)
+
+
+def test_penalty_contact_adds_its_own_operations():
+    """A push out of a plane and out of a ball adds its own operations and a sum per coordinate: no branch, no gather, no velocity where
+    there is no friction.
+    """
+    plain = seen(library_step())
+    for obstacle in (js.contact.Plane((0.0, 0.0), (0.0, 1.0)), js.contact.Sphere((0.0, 0.0), 1.0)):
+        push = js.contact.Penalty(obstacle, 10.0)
+        with_push, alone = seen(library_step(push)), seen(force_alone(push, 2))
+        assert with_push == plain + alone + Counter(add=2)
+        assert not {"case", "while", "gather", "scatter", "sort"} & set(alone)
+        assert alone["sqrt"] == isinstance(obstacle, js.contact.Sphere)
+        assert sum(alone.values()) < 60
+
+
+def test_no_contact_no_import():
+    """A scene without contact loads none of its forces, and none of the fields of images and meshes."""
+    code = (
+        "import sys, numpy as np, jaxspring as js\n"
+        "net = js.lattice(3)\n"
+        "system = js.System(net, 1.0, js.Springs(net, 1.0, 1.0), rules=js.Heat(net, 1.0, 1.0))\n"
+        "system.bind(np.float32)\n"
+        "print([name for name in sys.modules if name.startswith('jaxspring.contact.')])"
+    )
+    run = subprocess.run([sys.executable, "-c", code], cwd=source.ROOT, capture_output=True, text=True, timeout=300)
+    loaded = run.stdout
+    assert run.returncode == 0, run.stderr
+    for name in ("penalty", "pairs", "law", "joined", "height_field", "mesh_field", "moving"):
+        assert f"contact.{name}'" not in loaded
 
 
 def test_no_heat_no_cost():

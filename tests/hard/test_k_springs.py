@@ -563,6 +563,7 @@ def instances():
         *(
             js.thermal.Radiation(TWO, nodes, 1.0, 300.0, 1.0),
             js.thermal.HotPlane((0.0,), (1.0,), 300.0, 1.0, 1.0, 0.1),
+            js.thermal.HotSurface(js.contact.Sphere((0.0,), 1.0), 300.0, 1.0, 1.0, 0.1),
             js.thermal.ThermalBoundary(),
         ),
         *(
@@ -576,6 +577,20 @@ def instances():
             js.contact.Contact(js.contact.Sphere((0.0,), 1.0)),
             js.contact.Impulses(),
             js.contact.Impulse(js.Vector((number,)), js.Vector((number,))),
+        ),
+        *(
+            js.contact.Plane((0.0,), (1.0,)),
+            js.contact.HalfSpaces([(0.0,)], [(1.0,)]),
+            js.contact.Sphere((0.0,), 1.0),
+            js.contact.Box((0.0,), (1.0,)),
+            js.contact.Capsule((0.0,), (1.0,), 1.0),
+            js.contact.Cylinder((0.0,), (1.0,), 1.0),
+            js.contact.HeightField(image),
+            js.contact.MeshField(np.eye(4, 3, -1), [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)], 0.5),
+            js.contact.Moving(js.contact.Sphere((0.0,), 1.0), place),
+            js.contact.SignedDistance(pull_of_one),
+            js.contact.Penalty(js.contact.Sphere((0.0,), 1.0), 1.0, 1.0, 1.0),
+            js.contact.NodeContact(TWO, 1.0, 1.0, rest=[[0.0], [1.0]], pairs=js.fluid.NeighbourList(4, 0.1)),
         ),
         *(js.thermal.ThermalExpansion(1e-3, 300.0), js.thermal.ThermalStiffness(1.0, 300.0, 350.0), js.fluid.Molten(TWO)),
         *(js.Dashpots(TWO, 1.0), js.Drag(0.1), js.Rayleigh(0.1, 0.2), js.Gravity((0.0, -9.81)), js.Load(push), js.Floor((0.0,), (1.0,))),

@@ -3,8 +3,10 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import jaxspring as js
+from jaxspring.progress import Stopwatch
 
 c = js.contact
 
@@ -15,16 +17,17 @@ def two_sheets(gap):
     sheet = js.lattice((n, n), js.STRUCTURAL + js.SHEAR)
     edges = np.concatenate([sheet.edges, sheet.edges + n * n])
     flat = np.c_[sheet.grid(1.0), np.zeros(n * n)]
-    return js.Graph.from_edges(edges, 2 * n * n), np.concatenate([flat, flat + [0.1, 0.05, gap]])
+    return js.Graph.from_edges(edges, 2 * n * n), np.concatenate([flat, flat + np.array([0.1, 0.05, gap])])
 
 
+@pytest.mark.slow
 def test_l10_sheets_closer_than_their_radius_do_not_explode():
     """Two sheets at rest a fifth of a contact distance apart have no force on them, to the bit, and stay; pressed together by a load they
     are pushed apart by the pairs that did not touch at rest alone.
     """
     net, points = two_sheets(0.2)
     rest = net.lengths(points)
-    contact = c.NodeContact(net, 0.5, 1e4, 1.0, 0.3, rest=points, pairs=js.fluid.NeighbourList(32, 0.3))
+    contact = c.NodeContact(net, 0.5, 1e4, 1.0, 0.3, rest=points)
     system = js.System(net, 1.0, (js.Springs(net, 100.0, rest), contact))
     state = js.State.from_points(net, points)
     run = js.rollout(system, state, js.VelocityVerlet(), 2e-3, 300)
@@ -35,6 +38,7 @@ def test_l10_sheets_closer_than_their_radius_do_not_explode():
     assert max(float(jnp.max(jnp.abs(a))) for a in wild.force(state)) > 1e3
 
 
+@pytest.mark.slow
 def test_l10_a_folded_sheet_keeps_its_thickness():
     """A strip folded on itself and pressed flat keeps its two layers a ball's diameter apart, less the depth that the load asks; without
     contact they fall through each other.
@@ -55,22 +59,30 @@ def test_l10_a_folded_sheet_keeps_its_thickness():
         js.raise_for_status(run)
         return np.asarray(run.state.points)[is_upper & (column > n + 1), 2]
 
-    contact = c.NodeContact(net, radius, k, onset=0.01, rest=flat, pairs=js.fluid.NeighbourList(16, 0.2))
+    contact = c.NodeContact(net, radius, k, onset=0.01, rest=flat)
     # Nodes lie on nodes: the two balls under a load stand as deep as it asks. The springs of the fold pull at the columns beside it.
     np.testing.assert_allclose(thickness(contact)[2:], 2 * radius - load / k - 0.005, rtol=5e-3)
     assert thickness().max() < -1.0
 
 
+@pytest.mark.slow
 def test_l10_the_cost_is_linear():
-    """Ten times the nodes take ten times the operations in a step, by the compiler's own count, not a hundred times."""
+    """Sixteen times the nodes, 1e4, take about sixteen times as long by a list; all pairs would take 256 times."""
 
-    def operations(n):
+    def program(n):
         net = js.lattice((n, n))
         points = np.c_[net.grid(1.0), np.zeros(n * n)]
         contact = c.NodeContact(net, 0.45, 100.0, rest=points, pairs=js.fluid.NeighbourList(12, 0.2))
         system = js.System(net, 1.0, contact).bind(jnp.float32)
-        state = system.begin(js.State.from_points(net, points.astype(np.float32)))
-        program = jax.jit(lambda system, state: system.force(state)).lower(system, state).compile()
-        return program.cost_analysis()["flops"] / n**2
+        state = jax.jit(lambda system, state: system.begin(state))(system, js.State.from_points(net, points.astype(np.float32)))
+        force = jax.jit(lambda system, state: system.force(state))
+        jax.block_until_ready(force(system, state))
+        return lambda: jax.block_until_ready(force(system, state))
 
-    assert operations(95) < 1.3 * operations(30)
+    programs, times = (program(25), program(100)), ([], [])
+    for _ in range(15):
+        for run, taken in zip(programs, times, strict=True):
+            clock = Stopwatch()
+            run()
+            taken.append(clock.seconds)
+    assert min(times[1]) < 48 * min(times[0])

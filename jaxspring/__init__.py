@@ -1,7 +1,7 @@
 """Differentiable mass-spring physics on JAX: springs, damping, data springs to images, adaptive meshes.
 
 Every public name is loaded on first use, so that `import jaxspring` costs little more than `import jax`. What most scenes need is here;
-what experts choose is in `jaxspring.linalg`, `.images`, `.thermal`, `.fluid`, `.inverse`, `.reconstruction`, `.steppers` and `.topology`.
+what experts choose is in `jaxspring.linalg`, `.images`, `.thermal`, `.fluid`, `.inverse`, `.reconstruction`, `.robot`, `.steppers` and `.topology`.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ if TYPE_CHECKING:  # written by `python -m tests.face`
     from . import inverse as inverse
     from . import linalg as linalg
     from . import reconstruction as reconstruction
+    from . import robot as robot
     from . import steppers as steppers
     from . import thermal as thermal
     from . import topology as topology
@@ -116,7 +117,6 @@ if TYPE_CHECKING:  # written by `python -m tests.face`
     from .steppers.still import Still as Still
     from .thermal.fusing import Fusing as Fusing
     from .thermal.heat import Heat as Heat
-    from .thermal.ledger import Account as Account
     from .thermal.ledger import Ledger as Ledger
     from .thermal.ledger import energy_ledger as energy_ledger
     from .inverse.fit import Fit as Fit

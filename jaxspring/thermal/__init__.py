@@ -24,6 +24,7 @@ if TYPE_CHECKING:  # written by `python -m tests.face`
     from .heat import total_heat as total_heat
     from .hot_plane import HotPlane as HotPlane
     from .latent import LatentHeat as LatentHeat
+    from .ledger import Account as Account
     from .schemes import BackwardEulerHeat as BackwardEulerHeat
     from .schemes import CrankNicolsonHeat as CrankNicolsonHeat
     from .schemes import ExplicitHeat as ExplicitHeat
@@ -34,7 +35,6 @@ if TYPE_CHECKING:  # written by `python -m tests.face`
     from .stiffness import ThermalStiffness as ThermalStiffness
     from .fusing import Fusing as Fusing
     from .heat import Heat as Heat
-    from .ledger import Account as Account
     from .ledger import Ledger as Ledger
     from .ledger import energy_ledger as energy_ledger
 else:

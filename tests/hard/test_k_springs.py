@@ -485,7 +485,7 @@ def instances():
     )
     pixels = js.reconstruction.PixelSprings(None, 1.0)
     classes = [
-        js.Account(number, number, number, number, number, number),
+        js.thermal.Account(number, number, number, number, number, number),
         *(js.Adam(), js.LBFGS(), js.LeastSquares(), js.inverse.Optax(optax.identity()), js.Stop()),
         *(
             js.fluid.AllPairs(),
@@ -627,7 +627,7 @@ def test_k6_the_table_has_every_public_class():
     wanted = {n for n, c in classes.items() if inspect.isclass(c) and not inspect.isabstract(c) and not issubclass(c, Exception)}
     bases = {n for n in wanted if any(classes[n] in type(a).__mro__[1:] for a in INSTANCES.values())}
     assert not wanted - set(INSTANCES) - bases
-    assert Account is js.Account
+    assert Account is js.thermal.Account
 
 
 def is_same(a, b):

@@ -74,6 +74,11 @@ def number(value: float) -> np.ndarray:
 
 
 DOORS: dict[str, Door] = {
+    "Actuation": Door(
+        lambda **a: js.robot.Actuation(abs, **a),
+        {"groups": np.array([0, -1, 1]), "low": number(0.5), "high": number(1.25)},
+        on_host=("groups",),
+    ),
     "Combined": Door(
         lambda weights: js.images.Combined((js.images.Intensity(), js.images.Curvature()), weights), {"weights": np.array([1.0, 2.0])}
     ),
@@ -123,6 +128,7 @@ DOORS: dict[str, Door] = {
     "Motion": Door(lambda moved: js.Motion(moved, lambda t: js.Vector((t,))), {"moved": PATTERN}),
     "NeighbourList": Door(lambda skin: js.fluid.NeighbourList(8, skin), {"skin": number(0.5)}),
     "PairDrag": Door(js.fluid.PairDrag, {"damping": number(2.0), "radius": number(1.5)}),
+    "Oscillators": Door(js.robot.Oscillators, {"amplitude": per_spring(), "phase": per_spring(0.5), "frequency": number(2.0)}),
     "PixelSprings": Door(lambda stiffness: js.reconstruction.PixelSprings(cast(Any, None), stiffness), {"stiffness": number(2.0)}),
     "PlainCutoff": Door(js.fluid.PlainCutoff, {"radius": number(2.5)}),
     "Radiation": Door(
@@ -177,6 +183,11 @@ DOORS: dict[str, Door] = {
     "replace": Door(lambda **a: js.replace(system(), **a), {"stiffness": per_spring(), "rest_length": per_spring(), "mass": per_node()}),
     "rollout": Door(lambda dt: js.rollout(system(), state(), js.SymplecticEuler(), dt, 2).state, {"dt": number(0.0625)}),
     "smooth": Door(lambda sigma: js.images.smooth(image(), sigma, radius=4), {"sigma": number(1.0)}),
+    "walking_robot": Door(
+        lambda **a: js.robot.walking_robot(net=js.from_triangles(TRIANGLES, N), **a),
+        {"points": SQUARE, "groups": np.array([0, 1, -1, 0, 1])},
+        on_host=("groups",),
+    ),
     "squared_distance": Door(lambda target: js.squared_distance(jnp.zeros((N, 2)), target), {"target": np.arange(8.0).reshape(N, 2)}),
 }
 
@@ -185,7 +196,7 @@ BY_HAND = {"diffeqsolve", "fit", "check_gradient", "frequency_response", "from_n
 
 # What the library makes and hands out; nobody else builds it.
 MADE_INSIDE = """
-    Account Blocks BoundSystem Energy Equilibrium Finding Fit GradientCheck History Iteration Memory Modes NodeDyads
+    Account Blocks Body BoundSystem Energy Equilibrium Finding Fit GradientCheck History Iteration Memory Modes NodeDyads
     OdeInfo OdeResult Overlay Profile Reconstructed Result Resume Scene Selection SkylineFactor SolveInfo Solves
     SpringBlocks SpringMatrix Status Step Surface Undetermined
 """
@@ -196,14 +207,13 @@ NO_ARRAYS = """
     Checkpointed ConstantsSettings CrankNicolsonHeat CubicSpline Curvature Cutoff EnergyLaw EqualCells ExactSolver ExactTangent
     ExpansionRule ExplicitHeat Flag Force ForwardEuler GradientMagnitude GradientWarning HalfCells HeatIteration HeatScheme Hooke
     Identity ImageError ImplicitMidpoint Intensity Jacobi JaxCG LBFGS Lattice Law LeastSquares Ledger LinearSolver Linearisation
-    Lineax Luminance Molten Multigrid Natural Newton NoCutoff Observation Optax Optimiser Ordering PairLaw Pairs Positive PowerLaw
-    Preconditioner Progress PullLaw Reconstruction Relaxation ReverseCuthillMcKee Rule RungeKutta4 Sampling Secant SemiImplicit
-    SimulationError Skyline SoftPositive SplitHeat SpringSettings StabilityWarning Stepper StiffnessRule Still Stop StopReason
-    StoreAll StoreStates SymmetricSplitHeat SymplecticEuler Tangent TensionOnly ThermalBoundary Topology Transform Unpreconditioned
-    VelocityVerlet animate batch domain elevation_model
-    energy_ledger equilibrium fit_constants fit_springs from_mesh gradient_magnitude load
-    load_image melted_fraction normal_modes principal_curvatures raise_for_status save save_trajectory select smoothing_radius
-    stable_dt total_heat
+    Lineax Luminance Molten Multigrid Natural NeuralController Newton NoCutoff Observation Optax Optimiser Ordering PairLaw Pairs
+    Positive PowerLaw Preconditioner Progress PullLaw Reconstruction Relaxation ReverseCuthillMcKee Robot RobotSettings Rule
+    RungeKutta4 Sampling Secant SemiImplicit SimulationError Skyline SoftPositive SplitHeat SpringSettings StabilityWarning Stepper
+    StiffnessRule Still Stop StopReason StoreAll StoreStates SymmetricSplitHeat SymplecticEuler Tangent TensionOnly ThermalBoundary
+    Topology Transform Unpreconditioned VelocityVerlet animate batch body_of_cells distance domain elevation_model energy_ledger
+    equilibrium fit_constants fit_springs from_mesh gradient_magnitude load load_image melted_fraction normal_modes
+    principal_curvatures raise_for_status save save_trajectory select smoothing_radius stable_dt total_heat train walk
 """
 
 

@@ -23,6 +23,10 @@ from .._checks import as_inexact, finite, positive
 from ..state import State
 
 
+N_WAVES = 4  # sin and cos of the beat and of its double
+FAINT = 0.1  # of the weight of what the sensors say, at first
+
+
 class Oscillators(eqx.Module):
     """Commands that swing about 1, each by itself, whatever the robot does.
 
@@ -119,9 +123,11 @@ class NeuralController(eqx.Module):
         """
         for name, value in (("frequency", frequency), ("size", size), ("reach", reach)):
             positive(name, as_inexact(name, value), "The network divides by it, or would command nothing.")
-        n_inputs = 4 + (2 * like.dim * math.prod(like.position.shape) if senses else 0)
+        n_inputs = N_WAVES + (2 * like.dim * math.prod(like.position.shape) if senses else 0)
         one, two = jax.random.split(key)
-        first = jax.random.normal(one, (n_hidden, n_inputs), like.dtype) / math.sqrt(n_inputs)
+        first = jax.random.normal(one, (n_hidden, n_inputs), like.dtype)
+        # A loop that listens to its sensors from the start is chaotic before it walks.
+        first = first * jnp.where(jnp.arange(n_inputs) < N_WAVES, 1 / math.sqrt(N_WAVES), FAINT / math.sqrt(n_inputs)).astype(like.dtype)
         second = jax.random.normal(two, (n_commands, n_hidden), like.dtype) / math.sqrt(n_hidden)
         zeros = (jnp.zeros(n_hidden, like.dtype), jnp.zeros(n_commands, like.dtype))
         return NeuralController(first, zeros[0], second, zeros[1], float(frequency), float(size), float(reach), bool(senses))

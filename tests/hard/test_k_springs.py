@@ -483,7 +483,7 @@ def instances():
         None,
         "",
     )
-    pixels = js.reconstruction.PixelSprings(None, 1.0)
+    pixels, robot = js.reconstruction.PixelSprings(None, 1.0), js.robot.walking_robot(js.robot.RobotSettings(body=("#",)))
     classes = [
         js.thermal.Account(number, number, number, number, number, number),
         *(js.Adam(), js.LBFGS(), js.LeastSquares(), js.inverse.Optax(optax.identity()), js.Stop()),
@@ -614,6 +614,8 @@ def instances():
             js.inverse.GradientCheck((), 1.0, status),
         ),
         js.inverse.Undetermined(1, {"k": whole}, None, ("k",)),
+        *(robot, robot.settings, robot.controller, js.robot.body_of_cells(("#",), 1.0)),
+        *(js.robot.Oscillators([0.1], [0.0], 1.0), js.robot.Actuation(js.robot.Oscillators([0.1], [0.0], 1.0), [0])),
     ]
     return {type(a).__name__: a for a in classes}
 

@@ -114,7 +114,6 @@ def report_of(settings: RobotSettings, found: Fit, walks: dict[str, Frames], sec
         "settings": asdict(settings),
         "versions": versions(),
         "walked_m": {name: float(frames.distance[-1]) for name, frames in walks.items()},
-        "ratio": float(walks["after"].distance[-1] / walks["before"].distance[-1]) if walks["before"].distance[-1] else None,
         "iterations": {"done": len(distances) - 1, "best": found.iteration},
         "distance_m": distances.tolist(),
         "lowest_node_m": min(float(frames.points[..., -1].min()) for frames in walks.values()),

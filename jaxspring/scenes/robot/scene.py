@@ -66,7 +66,7 @@ class RobotSettings:
     cell: float = 0.1
     node_mass: float = 0.05
     stiffness: float = 300.0
-    damping: float = 0.6
+    damping: float = 1.2
     friction: float = 0.6
     gravity: float = 9.81
     frequency: float = 2.0

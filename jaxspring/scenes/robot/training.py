@@ -14,7 +14,8 @@ from ...inverse.optimisers import Adam
 from .scene import Robot, distance
 
 N_ITERATIONS = 100
-LEARNING_RATE = 0.02
+LEARNING_RATE = 0.005
+LARGEST_NORM = 1.0  # m per unit of weight: an impact that is just missed makes a gradient long
 
 
 class _Loss(eqx.Module):
@@ -47,7 +48,7 @@ def train(
     Returns:
         A `Fit`: `parameters` is the controller that walked farthest, `history.loss` minus the distances [m].
     """
-    optimiser = Adam(learning_rate, decay_over=max(n_iterations, 1))
+    optimiser = Adam(learning_rate, decay_over=max(n_iterations, 1), largest_norm=LARGEST_NORM)
     return fit(_Loss(robot), robot.controller, optimiser, n_iterations, on_iteration, checkpoint=checkpoint, resume=resume)
 
 

@@ -50,7 +50,11 @@ def scene(kind: str) -> Scene:
         first[..., 4 + d * n_nodes + order.order] = parts["first"][..., 4 + d * n_nodes : 4 + (d + 1) * n_nodes]
     constants = {"k": s.stiffness, "mass": s.node_mass, "size": s.cell, "n_groups": n_groups}
     constants |= {name: getattr(s, name) for name in ("damping", "friction", "gravity", "frequency", "reach")} | {"dt": s.step}
-    body = {"x": np.asarray(robot.state.points), "edges": np.asarray(robot.net.edges, np.int32), "groups": np.asarray(springs.actuation.groups)}
+    body = {
+        "x": np.asarray(robot.state.points),
+        "edges": np.asarray(robot.net.edges, np.int32),
+        "groups": np.asarray(springs.actuation.groups),
+    }
     return Scene({"kind": kind, **body, "l": np.asarray(springs.rest_length, np.float32), **constants, **parts, "first": first})
 
 

@@ -1,7 +1,8 @@
 """Differentiable mass-spring physics on JAX: springs, damping, data springs to images, adaptive meshes.
 
 Every public name is loaded on first use, so that `import jaxspring` costs little more than `import jax`. What most scenes need is here;
-what experts choose is in `jaxspring.linalg`, `.images`, `.thermal`, `.fluid`, `.inverse`, `.reconstruction`, `.robot`, `.steppers` and `.topology`.
+what experts choose is in `jaxspring.linalg`, `.images`, `.thermal`, `.fluid`, `.inverse`, `.reconstruction`, `.robot`, `.steppers` and
+`.topology`.
 """
 
 from __future__ import annotations

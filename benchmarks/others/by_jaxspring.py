@@ -145,7 +145,12 @@ def fluid(scene: Scene) -> Program:
 
 def robots(scene: Scene, chunk: int) -> Program:
     """`js.robot.distance` of many controllers, or its gradient by all weights, by `js.batch`."""
-    names = {"cell": "size", "node_mass": "mass", "stiffness": "k", **{n: n for n in ("damping", "friction", "gravity", "frequency", "reach", "dt")}}
+    names = {
+        "cell": "size",
+        "node_mass": "mass",
+        "stiffness": "k",
+        **{n: n for n in ("damping", "friction", "gravity", "frequency", "reach", "dt")},
+    }
     settings = js.robot.RobotSettings(**{name: float(scene[of]) for name, of in names.items()})
     net = js.Graph.from_edges(scene["edges"], len(scene["x"]))
     robot = js.robot.walking_robot(settings, net=net, points=scene["x"], groups=scene["groups"], dtype=jnp.dtype(jnp.float32))

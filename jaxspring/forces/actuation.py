@@ -36,9 +36,9 @@ class Actuation(eqx.Module):
     """Rest lengths that a controller drives, for `Springs(..., actuation=...)`.
 
     Attributes:
-        controller: state -> commands, factors of the rest lengths: one number, (E,) in the user's order, or with `groups` (G,). Any callable
-            whose weights are a tree of arrays: a module of equinox, `jax.tree_util.Partial(model.apply, variables)`, a function of
-            `state.time`. It is called once a step, with the state in which the step begins.
+        controller: state -> commands, factors of the rest lengths: one number, (E,) in the user's order, or with `groups` (G,). Any
+            callable whose weights are a tree of arrays: a module of equinox, a function of `state.time`. It is called once a step, with
+            the state in which the step begins.
         groups: (E,) group of each spring, from 0, in the user's order; -1 where nobody drives it. None: no groups.
         low, high: range to which commands are clipped; beyond it they have no derivative.
         n_groups: G, or None where there are no groups (static).

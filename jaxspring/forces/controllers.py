@@ -22,7 +22,6 @@ from .._arrays import Numbers
 from .._checks import as_inexact, finite, positive
 from ..state import State
 
-
 N_WAVES = 4  # sin and cos of the beat and of its double
 FAINT = 0.1  # of the weight of what the sensors say, at first
 

@@ -31,7 +31,8 @@ class Stepper(eqx.Module):
 
     def after_rules(self, system: BoundSystem, before: State, moved: State, now: State, dt: Array, memory: Any) -> Any:
         """What to carry where rules have changed positions or velocities: the step began at `before`, motion ended at `moved`, rules left
-        `now`. A stepper that carries what belongs to a place, a velocity or a command makes it anew; called only where a rule may change them.
+        `now`. A stepper that carries what belongs to a place, a velocity or a command makes it anew; called only where a rule may change
+        them.
         """
         return memory
 

@@ -1,7 +1,7 @@
 """The body of a robot: square or cubic cells, as drawn, and a spring between every two corners of a cell.
 
-    sides        along the axes, one actuator each
-    diagonals    of faces and cubes, which nobody drives: they keep the cells from folding
+sides        along the axes, one actuator each
+diagonals    of faces and cubes, which nobody drives: they keep the cells from folding
 """
 
 from __future__ import annotations

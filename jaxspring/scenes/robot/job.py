@@ -27,6 +27,7 @@ from .pictures import draw_animation, draw_learning, draw_walks
 from .scene import Robot, RobotSettings, walk, walking_robot
 from .training import train
 
+
 @dataclass(frozen=True)
 class Frames:
     """What was seen of a walk, host arrays.

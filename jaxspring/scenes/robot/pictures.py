@@ -38,23 +38,23 @@ def draw_learning(path: pathlib.Path, distances: list[float]) -> None:
 
 
 def draw_walks(path: pathlib.Path, walks: dict[str, Any]) -> None:
-    """Both walks from the side, one above the other on one scale: six moments each, evenly spaced in time, each in a panel.
+    """Both walks from the side, next to each other on one scale: six moments each, evenly spaced in time, from the top down.
 
     Raises:
         ImportError: matplotlib is not installed.
     """
     canvas, figure_of = canvas_and_figure()
-    box = _box(walks)
-    figure = figure_of((14, 1.2 + 4.4 * max((box[3] - box[2]) / (box[1] - box[0]), 0.25) * 2), DPI, layout="constrained")
+    box, scale = _box(walks), _scale(walks)
+    panel = 5.6 * (box[3] - box[2]) / (box[1] - box[0])  # inches high
+    figure = figure_of((13, N_SHOWN * (panel + 0.3) + 0.6), DPI, layout="constrained")
     canvas(figure)
-    rows = figure.subplots(len(walks), N_SHOWN // 2 * 2, sharex=True, sharey=True)
-    scale = _scale(walks)
-    for row, (name, frames) in zip(rows, walks.items(), strict=True):
-        for axes, i in zip(row, np.linspace(0, len(frames.time) - 1, N_SHOWN).round().astype(int), strict=True):
+    columns = figure.subplots(N_SHOWN, len(walks), sharex=True, sharey=True).T
+    for column, (name, frames) in zip(columns, walks.items(), strict=True):
+        for axes, i in zip(column, np.linspace(0, len(frames.time) - 1, N_SHOWN).round().astype(int), strict=True):
             _panel(axes, frames, int(i), box, scale)
-            axes.set_title(f"{name}, {frames.time[i]:.2f} s, {frames.distance[i]:+.2f} m", fontsize=9)
+            axes.set_title(f"{name}, {_moment(frames, int(i))}", fontsize=9)
             axes.label_outer()
-    _colour_bar(figure, list(np.ravel(rows)), scale)
+    _colour_bar(figure, list(np.ravel(columns)), scale)
     figure.savefig(path, metadata={"Software": None})
 
 
@@ -68,7 +68,8 @@ def draw_animation(path: pathlib.Path, walks: dict[str, Any]) -> None:
     from matplotlib.animation import FuncAnimation, PillowWriter
 
     box, scale = _box(walks), _scale(walks)
-    figure = figure_of((8, 5), 80, layout="constrained")
+    panel = 6.5 * (box[3] - box[2]) / (box[1] - box[0])  # inches high
+    figure = figure_of((8, len(walks) * (panel + 0.5) + 0.5), 80, layout="constrained")
     canvas(figure)
     rows = figure.subplots(len(walks), 1, sharex=True)
     _colour_bar(figure, list(rows), scale)
@@ -80,7 +81,7 @@ def draw_animation(path: pathlib.Path, walks: dict[str, Any]) -> None:
             axes.clear()
             i = int(chosen[frame])
             _panel(axes, frames, i, box, scale)
-            axes.set_title(f"{name}: {frames.time[i]:.2f} s, {frames.distance[i]:+.2f} m")
+            axes.set_title(f"{name}: {_moment(frames, i)}")
         rows[0].set_xlabel("")
         return []
 
@@ -103,6 +104,11 @@ def _panel(axes: Any, frames: Any, i: int, box: tuple[float, float, float, float
     axes.add_collection(driven)
     axes.plot(*side.T, "o", color="0.25", markersize=2.5)
     axes.set(xlim=box[:2], ylim=box[2:], aspect="equal", xlabel="x (m)", ylabel="height (m)")
+
+
+def _moment(frames: Any, i: int) -> str:
+    """Time and distance in words."""
+    return f"{frames.time[i]:.2f} s, {round(float(frames.distance[i]), 2) + 0.0:+.2f} m"
 
 
 def _colour_bar(figure: Any, axes: list[Any], scale: float) -> None:

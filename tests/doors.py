@@ -75,7 +75,7 @@ def number(value: float) -> np.ndarray:
 
 DOORS: dict[str, Door] = {
     "Actuation": Door(
-        lambda **a: js.robot.Actuation(abs, **a),
+        lambda **a: js.robot.Actuation(repr, **a),
         {"groups": np.array([0, -1, 1]), "low": number(0.5), "high": number(1.25)},
         on_host=("groups",),
     ),

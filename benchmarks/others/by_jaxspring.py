@@ -151,7 +151,8 @@ def robots(scene: Scene, chunk: int) -> Program:
         "stiffness": "k",
         **{n: n for n in ("damping", "friction", "gravity", "frequency", "reach", "dt")},
     }
-    settings = js.robot.RobotSettings(**{name: float(scene[of]) for name, of in names.items()})
+    numbers: dict[str, Any] = {name: float(scene[of]) for name, of in names.items()}
+    settings = js.robot.RobotSettings(**numbers)
     net = js.Graph.from_edges(scene["edges"], len(scene["x"]))
     robot = js.robot.walking_robot(settings, net=net, points=scene["x"], groups=scene["groups"], dtype=jnp.dtype(jnp.float32))
     n_nodes, order = net.n_nodes, net.node_permutation.order

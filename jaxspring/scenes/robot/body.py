@@ -40,8 +40,15 @@ def body_of_cells(drawing: tuple[str, ...], size: float, depth: int = 0) -> Body
         size: of a cell [m].
         depth: cells across the way; 0 makes the body flat, in two dimensions.
 
+    Returns:
+        A `Body`: net, points [m], and the actuator of each spring.
+
     Raises:
         ValueError: no cell, rows of different length, other characters, a negative depth.
+
+    >>> body = body_of_cells(("##",), size=0.1)
+    >>> print(body.points.shape, body.net.n_springs, body.groups.max() + 1)
+    (6, 2) 11 7
     """
     _check(drawing, depth)
     rows = len(drawing)

@@ -142,6 +142,9 @@ def walking_robot(
         groups: (E,) actuator of each of its springs, -1 where it has none; each spring has its own unless said.
         dtype: of the state; JAX's default unless said.
 
+    Returns:
+        A `Robot`: net, system, start and settings.
+
     Raises:
         ValueError: a net without points, or points and groups without a net; points in one dimension.
 
@@ -186,6 +189,13 @@ def walk(
         n_steps: the settings' duration unless said.
         save_every: as in `rollout`.
         observe: as in `rollout`.
+
+    Returns:
+        A `Result`, as `rollout` gives it.
+
+    >>> robot = walking_robot(RobotSettings(body=("##",), duration=0.1))
+    >>> print(walk(robot, n_steps=2).state.time.round(4))
+    0.007
     """
     system = robot.system if controller is None else robot.driven_by(controller)
     n_steps = robot.settings.n_steps if n_steps is None else n_steps
@@ -194,6 +204,14 @@ def walk(
 
 def distance(robot: Robot, controller: Any = None, n_steps: int | None = None) -> Array:
     """What the mean of x has gained at the end of a walk [m].
+
+    Args:
+        robot: who walks.
+        controller: of the same kind as the robot's own, which is taken unless said.
+        n_steps: the settings' duration unless said.
+
+    Returns:
+        A 0-d array [m], differentiable by the weights of the controller and by the robot's constants.
 
     >>> robot = walking_robot(RobotSettings(body=("##",), duration=0.1))
     >>> print(jax.grad(lambda controller: distance(robot, controller))(robot.controller).second.shape)

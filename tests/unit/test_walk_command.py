@@ -4,7 +4,6 @@ import json
 import math
 import signal
 
-import jax
 import numpy as np
 import pytest
 
@@ -120,4 +119,3 @@ def test_a_small_robot(tmp_path, capsys, monkeypatch):
         del one["seconds"]
     assert again == report
     assert len((out / "checkpoint.npz").read_bytes()) == len(weights)
-    jax.clear_caches()

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..._arrays import Numbers
-from ..._checks import nonnegative, positive
+from ..._checks import as_inexact, nonnegative, positive
 from ...forces.actuation import Actuation
 from ...forces.contact import Floor
 from ...forces.controllers import NeuralController
@@ -159,15 +159,17 @@ def walking_robot(
     if net is None or points is None:
         body = body_of_cells(s.body, s.cell, s.depth)
         net, points, groups = body.net, body.points, body.groups
-    start = State.from_points(net, jnp.asarray(points, dtype))
+    points = as_inexact("points", points, dtype)
+    start = State.from_points(net, points)
     if start.dim == 1:
         raise ValueError("points have one coordinate; a robot walks in two or three dimensions.")
-    n_commands = net.n_springs if groups is None else Actuation(bool, groups).n_groups
+    plan = Actuation(repr, groups)  # of its groups, before there is a controller for as many
+    n_commands = net.n_springs if plan.n_groups is None else plan.n_groups
     if controller is None:
         key = jax.random.key(s.seed)
-        controller = NeuralController.random(key, start, n_commands or 0, s.n_hidden, s.frequency, s.cell, s.reach)
+        controller = NeuralController.random(key, start, n_commands, s.n_hidden, s.frequency, s.cell, s.reach)
     up = jnp.zeros(start.dim).at[-1].set(1.0)
-    actuation = Actuation(controller, groups, 1 - s.reach, 1 + s.reach)
+    actuation = Actuation(controller, plan.groups, 1 - s.reach, 1 + s.reach)
     springs = Springs(net, s.stiffness, net.lengths(points), actuation=actuation)
     forces = (springs, Dashpots(net, s.damping), Gravity(-s.gravity * up))
     system = System(net, s.node_mass, forces, rules=Floor(jnp.zeros(start.dim), up, s.friction))

@@ -126,7 +126,8 @@ class NeuralController(eqx.Module):
         one, two = jax.random.split(key)
         first = jax.random.normal(one, (n_hidden, n_inputs), like.dtype)
         # A loop that listens to its sensors from the start is chaotic before it walks.
-        first = first * jnp.where(jnp.arange(n_inputs) < N_WAVES, 1 / math.sqrt(N_WAVES), FAINT / math.sqrt(n_inputs)).astype(like.dtype)
+        is_wave = jnp.arange(n_inputs) < N_WAVES
+        first = first * jnp.where(is_wave, 1 / math.sqrt(N_WAVES), FAINT / math.sqrt(n_inputs)).astype(like.dtype)[None, :]
         second = jax.random.normal(two, (n_commands, n_hidden), like.dtype) / math.sqrt(n_hidden)
         zeros = (jnp.zeros(n_hidden, like.dtype), jnp.zeros(n_commands, like.dtype))
         return NeuralController(first, zeros[0], second, zeros[1], float(frequency), float(size), float(reach), bool(senses))

@@ -122,7 +122,7 @@ class Actuation(eqx.Module):
 
 def _as_groups(groups: Any) -> np.ndarray:
     """Groups of the object's own, which nobody can change."""
-    found = as_indices("groups", groups).copy()
+    found = as_indices("groups", groups).astype(np.int32)
     if found.ndim != 1:
         raise ValueError(f"groups has shape {found.shape}; expected (E,), one whole number per spring.")
     if np.any(found < PASSIVE):

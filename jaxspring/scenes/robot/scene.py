@@ -196,8 +196,8 @@ def walk(
         A `Result`, as `rollout` gives it.
 
     >>> robot = walking_robot(RobotSettings(body=("##",), duration=0.1))
-    >>> print(walk(robot, n_steps=2).state.time.round(4))
-    0.007
+    >>> print(walk(robot, n_steps=2).info.n_steps)
+    2
     """
     system = robot.system if controller is None else robot.driven_by(controller)
     n_steps = robot.settings.n_steps if n_steps is None else n_steps

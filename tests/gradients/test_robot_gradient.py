@@ -26,8 +26,8 @@ def test_the_gradient_of_a_walk_is_that_of_central_differences():
     ways = ways / np.linalg.norm(ways, axis=1, keepdims=True)
     value, gradient = jax.jit(jax.value_and_grad(walked))(weights)
     assert weights.dtype == gradient.dtype == jnp.float64
-    h = 1e-5
-    ends = np.asarray(jax.jit(jax.vmap(walked))(np.concatenate([weights + h * ways, weights - h * ways, weights[None]])))
+    h, at = 1e-5, np.asarray(weights)
+    ends = np.asarray(jax.jit(jax.vmap(walked))(np.concatenate([at + h * ways, at - h * ways, at[None]])))
     slopes = (ends[:N_DIRECTIONS] - ends[N_DIRECTIONS:-1]) / (2 * h)
     found = ways @ np.asarray(gradient)
     assert ends[-1] == pytest.approx(float(value), abs=1e-12)

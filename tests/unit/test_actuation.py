@@ -15,11 +15,9 @@ SHEET = js.lattice((2, 3), js.STRUCTURAL + js.SHEAR)
 GRAPH = js.Graph.from_edges([(0, 3), (3, 1), (2, 1), (0, 2)], 4)
 SQUARE = np.array([[0.0, 0.0], [1.1, 0.2], [0.1, 1.0], [1.0, 1.2]])
 STEPPERS = [
-    js.SymplecticEuler(),
     js.VelocityVerlet(),
     js.RungeKutta4(),
     js.SemiImplicit(),
-    js.BackwardEuler(),
     js.BackwardEuler(newton=True),
     js.ImplicitMidpoint(),
     js.BDF2(),
@@ -112,6 +110,7 @@ def test_bad_input_is_named():
     assert bool(traced.status.has(js.Flag.INVALID))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stepper", STEPPERS, ids=lambda s: f"{type(s).__name__}{'' if getattr(s, 'newton', None) is None else ' newton'}")
 def test_a_command_holds_for_a_step(stepper):
     """A step of driven springs is that of passive ones with the rest lengths of its beginning, though the controller reads places and
@@ -148,6 +147,7 @@ def test_a_command_is_of_the_state_after_all_rules():
     assert float(system.recall(end, 0)) == 1.0
 
 
+@pytest.mark.slow
 def test_the_ledger_books_the_work_of_actuators():
     """Between held ends the actuators' work is the change of k/2 (r - l c)^2, exactly; where all moves, the books close, and only the
     work of the actuators can have brought energy in.
@@ -171,6 +171,7 @@ def test_the_ledger_books_the_work_of_actuators():
     assert errors[1] < 0.5 * errors[0] < 0.2 * book["work"]["Springs"]
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_bit_for_bit(tmp_path):
     """In two parts, and through a file, a run with commands ends in the bits of the unbroken one."""
     system, stepper = driven(), js.VelocityVerlet()
@@ -187,6 +188,7 @@ def test_a_run_goes_on_bit_for_bit(tmp_path):
             np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.slow
 def test_controllers_are_batched_and_keep_the_dtype():
     """`vmap` over weights gives each lane its own run; float32 stays float32 though the weights are float64."""
 
@@ -201,6 +203,7 @@ def test_controllers_are_batched_and_keep_the_dtype():
     np.testing.assert_allclose(single.points, lanes[2], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_without_steps_the_command_is_of_every_moment():
     """`diffeqsolve` asks the controller all the time: fixed steps come near its answer at order one. `equilibrium` holds the command of
     the state that it is given.

@@ -60,6 +60,7 @@ def test_a_body_is_what_is_drawn():
     assert sorted(legs.points[legs.points[:, 1] == 0][:, 0]) == [0, 1, 2, 3]
 
 
+@pytest.mark.slow
 def test_a_body_of_ones_own_and_three_dimensions():
     """A net with points makes a robot in which every spring is driven; `depth` makes one in three dimensions. Both stay on the ground."""
     net = js.from_triangles([[0, 1, 2], [1, 3, 2]], 4)

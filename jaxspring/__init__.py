@@ -1,7 +1,8 @@
 """Differentiable mass-spring physics on JAX: springs, damping, data springs to images, adaptive meshes.
 
 Every public name is loaded on first use, so that `import jaxspring` costs little more than `import jax`. What most scenes need is here;
-what experts choose is in `jaxspring.linalg`, `.images`, `.thermal`, `.fluid`, `.inverse`, `.reconstruction`, `.steppers` and `.topology`.
+what experts choose is in `jaxspring.linalg`, `.images`, `.thermal`, `.fluid`, `.inverse`, `.reconstruction`, `.robot`, `.steppers` and
+`.topology`.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ if TYPE_CHECKING:  # written by `python -m tests.face`
     from . import linalg as linalg
     from . import plasticity as plasticity
     from . import reconstruction as reconstruction
+    from . import robot as robot
     from . import steppers as steppers
     from . import thermal as thermal
     from . import topology as topology
@@ -67,8 +69,6 @@ if TYPE_CHECKING:  # written by `python -m tests.face`
     from .topology.graph import Graph as Graph
     from .topology.mesh_files import from_mesh as from_mesh
     from .topology.builders import delaunay as delaunay
-    from .topology.builders import from_networkx as from_networkx
-    from .topology.builders import from_scipy as from_scipy
     from .topology.builders import from_triangles as from_triangles
     from .images.image import Image as Image
     from .images.files import load_image as load_image

@@ -34,7 +34,7 @@ PUBLIC: dict[str, dict[str, tuple[str, ...]]] = {
         "topology.lattice": ("BEND", "BODY", "SHEAR", "STRUCTURAL", "Lattice", "lattice"),
         "topology.graph": ("Graph",),
         "topology.mesh_files": ("from_mesh",),
-        "topology.builders": ("delaunay", "from_networkx", "from_scipy", "from_triangles"),
+        "topology.builders": ("delaunay", "from_triangles"),
         "images.image": ("Image",),
         "images.files": ("load_image",),
         "forces.base": ("Finding", "Force", "Rule", "Scene", "Step"),
@@ -137,6 +137,13 @@ PUBLIC: dict[str, dict[str, tuple[str, ...]]] = {
         "scenes.reconstruction.fitting": ("Reconstructed", "SpringSettings", "fit_springs"),
         "scenes.reconstruction.constants": ("ConstantsSettings", "fit_constants"),
     },
+    "robot": {
+        "forces.actuation": ("Actuation",),
+        "forces.controllers": ("NeuralController", "Oscillators"),
+        "scenes.robot.body": ("Body", "body_of_cells"),
+        "scenes.robot.scene": ("Robot", "RobotSettings", "distance", "walk", "walking_robot"),
+        "scenes.robot.training": ("train",),
+    },
     "steppers": {
         "forces.linearisation": ("ExactTangent", "Linearisation", "Secant", "Tangent"),
     },
@@ -157,6 +164,7 @@ PUBLIC: dict[str, dict[str, tuple[str, ...]]] = {
     "topology": {
         "topology.edge_field": ("EdgeField",),
         "topology.base": ("Topology",),
+        "topology.builders": ("from_networkx", "from_scipy"),
         "topology.overlay": ("Overlay",),
         "topology.padding": ("NetBatch", "pad_nets"),
     },

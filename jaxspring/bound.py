@@ -20,7 +20,7 @@ from .forces.base import Force, Rule, Scene, Step, acts
 from .forces.contact import Books, Floor, strike
 from .forces.linearisation import Linearisation
 from .linalg.operators import Blocks
-from .memory import Owner, entry_at, matched, without_caches
+from .memory import Owner, entry_at, matched, with_entry, without_caches
 from .nodes import Free, Motion, Nodes, owning
 from .numerics import cast_inexact
 from .state import State
@@ -114,21 +114,36 @@ class BoundSystem(Nodes):
         return state
 
     def alone(self, state: State) -> State:
-        """The constrained state without what only `rollout` keeps up to date: histories stay, caches go.
+        """The constrained state without what only `rollout` keeps up to date: histories stay, caches and commands that hold for a step go.
 
         Raises:
             ValueError: the state holds the history of a part that this system does not have.
         """
-        return self.constrain(self.own(without_caches(state)))
+        state = self.own(without_caches(state))
+        for i, part in enumerate(self.parts):
+            state = replace(state, memory=with_entry(state.memory, i, None)) if part.drives and not part.is_idle else state
+        return self.constrain(state)
+
+    @property
+    def is_driven(self) -> bool:
+        """Whether commands change from step to step."""
+        return any(part.drives for _, part in self.followers)
+
+    def commanded(self, state: State) -> State:
+        """The state with the commands of this moment, which then hold."""
+        for part in (part for _, part in self.followers if part.drives):
+            state = part.keep(state, part.remember(state))
+        return state
 
     def follow(self, before: State, state: State, dt: Array) -> tuple[State, Status]:
         """What happens after a step besides motion, and what went wrong there."""
         total, followers = Status.ok(), self.followers
         obstacles = tuple((i, part) for i, part in followers if part.is_obstacle)
+        drivers = tuple((i, part) for i, part in followers if part.drives)
         watchers = tuple((i, part) for i, part in followers if part.watches)
         step, stages, impacts = self._step(before, state, dt, bool(obstacles)), [], None
         for i, part in followers:
-            if not part.is_obstacle and not part.watches:
+            if not part.is_obstacle and not part.drives and not part.watches:
                 state, status = _updated(part, step, state)
                 total = total.then(_placed(status, i))
                 stages += [] if isinstance(part, Force) else [(i, state)]
@@ -137,6 +152,10 @@ class BoundSystem(Nodes):
             state, status, impacts = _struck(tuple(part for _, part in obstacles), step, state, bool(watchers), is_kicked)
             total = total.then(_placed(status, obstacles[0][0]))
             stages.append((-1, state))
+        for i, part in drivers:
+            state, status = _updated(part, step, state)
+            total = total.then(_placed(status, i))
+            stages.append((i, state))
         step = replace(step, stages=tuple(stages), impacts=impacts)
         for i, part in watchers:
             state, status = _updated(part, step, state)

@@ -22,6 +22,7 @@ DONE, FAILED, UNUSABLE, INTERRUPTED = 0, 1, 2, 130
 SCENES = (
     "reconstruction",
     "melting",
+    "robot",
 )
 
 

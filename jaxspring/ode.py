@@ -326,8 +326,11 @@ def _verdict(result: Any, n_steps: Array) -> Status:
 
 
 def _check_parts(system: System) -> None:
-    """ValueError naming what acts after steps, or remembers. A cache changes no result; anything else would be left out."""
-    rules = [type(part).__name__ for part in system.parts if not part.is_cache and (acts(part) or remembers(part))]
+    """ValueError naming what acts after steps, or remembers. A cache changes no result, and commands are
+    taken at every moment; anything else would be left out.
+    """
+    lasting = [part for part in system.parts if not part.is_cache and not part.drives]
+    rules = [type(part).__name__ for part in lasting if acts(part) or remembers(part)]
     if rules:
         raise ValueError(
             f"{', '.join(rules)}: this acts after steps of fixed length, which an adaptive solver does not take. Use rollout, or leave it "

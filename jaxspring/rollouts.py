@@ -304,7 +304,7 @@ def _advance(system: BoundSystem, stepper: Stepper, clock: _Clock, carry: Carry)
         return Carry(state, memory, index, solves)
     moved = state
     state, status = system.follow(carry.state, moved, dt)
-    if any(part.moves or part.breaks for _, part in system.followers):
+    if any(part.moves or part.breaks or part.drives for _, part in system.followers):
         memory = stepper.after_rules(system, carry.state, moved, state, dt, memory)
     status = stopped(eqx.tree_at(lambda s: s.step, status, jnp.where(status.flags != 0, index, status.step)))
     return Carry(state, memory, index, solves, carry.found.then(status))

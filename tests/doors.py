@@ -76,6 +76,11 @@ def number(value: float) -> np.ndarray:
 DOORS: dict[str, Door] = {
     "Box": Door(js.contact.Box, {"centre": np.array([0.0, 1.0]), "half_sizes": np.array([1.0, 2.0])}),
     "Capsule": Door(js.contact.Capsule, {"a": np.array([0.0, 1.0]), "b": np.array([1.0, 2.0]), "radius": number(0.5)}),
+    "Actuation": Door(
+        lambda **a: js.robot.Actuation(repr, **a),
+        {"groups": np.array([0, -1, 1]), "low": number(0.5), "high": number(1.25)},
+        on_host=("groups",),
+    ),
     "Combined": Door(
         lambda weights: js.images.Combined((js.images.Intensity(), js.images.Curvature()), weights), {"weights": np.array([1.0, 2.0])}
     ),
@@ -171,6 +176,7 @@ DOORS: dict[str, Door] = {
             "creep": number(0.5),
         },
     ),
+    "Oscillators": Door(js.robot.Oscillators, {"amplitude": per_spring(), "phase": per_spring(0.5), "frequency": number(2.0)}),
     "PixelSprings": Door(lambda stiffness: js.reconstruction.PixelSprings(cast(Any, None), stiffness), {"stiffness": number(2.0)}),
     "Plane": Door(js.contact.Plane, {"point": np.array([0.0, 1.0]), "normal": np.array([0.0, 2.0])}),
     "PlainCutoff": Door(js.fluid.PlainCutoff, {"radius": number(2.5)}),
@@ -215,7 +221,7 @@ DOORS: dict[str, Door] = {
         lambda **a: js.thermal.conductances(net(), **a), {"conductivity": per_node(), "spacing": number(0.5), "section": number(2.0)}
     ),
     "delaunay": Door(js.delaunay, {"points": SQUARE}, on_host=("points",)),
-    "from_scipy": Door(js.from_scipy, {"matrix": np.array([[0.0, 2.0], [2.0, 0.0]])}, on_host=("matrix",)),
+    "from_scipy": Door(js.topology.from_scipy, {"matrix": np.array([[0.0, 2.0], [2.0, 0.0]])}, on_host=("matrix",)),
     "from_triangles": Door(lambda triangles: js.from_triangles(triangles, N), {"triangles": TRIANGLES}, on_host=("triangles",)),
     "gentle_fluid": Door(js.fluid.gentle_fluid, {"spacing": number(0.5), "zeta": number(0.25), "alpha": number(2.0)}),
     "image_from_array": Door(js.images.image_from_array, {"pixels": PIXELS}),
@@ -231,6 +237,11 @@ DOORS: dict[str, Door] = {
     "replace": Door(lambda **a: js.replace(system(), **a), {"stiffness": per_spring(), "rest_length": per_spring(), "mass": per_node()}),
     "rollout": Door(lambda dt: js.rollout(system(), state(), js.SymplecticEuler(), dt, 2).state, {"dt": number(0.0625)}),
     "smooth": Door(lambda sigma: js.images.smooth(image(), sigma, radius=4), {"sigma": number(1.0)}),
+    "walking_robot": Door(
+        lambda **a: js.robot.walking_robot(net=js.from_triangles(TRIANGLES, N), **a),
+        {"points": SQUARE, "groups": np.array([0, 1, -1, 0, 1])},
+        on_host=("groups",),
+    ),
     "squared_distance": Door(lambda target: js.squared_distance(jnp.zeros((N, 2)), target), {"target": np.arange(8.0).reshape(N, 2)}),
 }
 
@@ -239,7 +250,7 @@ BY_HAND = {"diffeqsolve", "fit", "check_gradient", "frequency_response", "from_n
 
 # What the library makes and hands out; nobody else builds it.
 MADE_INSIDE = """
-    Account Blocks BoundSystem Energy Equilibrium Finding Fit GradientCheck History Impulse Iteration Memory Modes
+    Account Blocks Body BoundSystem Energy Equilibrium Finding Fit GradientCheck History Impulse Iteration Memory Modes
     NetBatch NodeDyads OdeInfo OdeResult Onset Overlay Profile Reconstructed Result Resume Scene Selection SkylineFactor
     SolveInfo Solves SpringBlocks SpringMatrix Status Step Surface Torn Undetermined Yielded
 """
@@ -250,15 +261,15 @@ NO_ARRAYS = """
     Checkpointed ConstantsSettings CrankNicolsonHeat CubicSpline Curvature Cutoff EnergyLaw EqualCells ExactSolver ExactTangent
     ExpansionRule ExplicitHeat Flag Force ForwardEuler GradientMagnitude GradientWarning HalfCells HeatIteration
     HeatScheme HeightField Hooke Identity ImageError ImplicitMidpoint Impulses Intensity Jacobi JaxCG LBFGS Lattice Law
-    LeastSquares Ledger LinearSolver Linearisation Lineax Luminance Molten Moving Multigrid Natural Newton NoCutoff
-    Observation Obstacle Optax Optimiser Ordering PairLaw Pairs Positive PowerLaw Preconditioner Progress PullLaw
-    Reconstruction Relaxation ReverseCuthillMcKee Rule RungeKutta4 Sampling Secant SemiImplicit SignedDistance
-    SimulationError Skyline SoftPositive SplitHeat SpringSettings StabilityWarning Stepper StiffnessRule Still Stop
-    StopReason StoreAll StoreStates SymmetricSplitHeat SymplecticEuler Tangent TensionOnly ThermalBoundary Topology
-    Transform Unpreconditioned VelocityVerlet animate batch domain elevation_model energy_ledger equilibrium
-    fit_constants fit_springs from_mesh gradient_magnitude impulses load load_image melted_fraction normal_modes
-    pad_nets principal_curvatures push_out raise_for_status save save_trajectory select smoothing_radius stable_dt
-    total_heat
+    LeastSquares Ledger LinearSolver Linearisation Lineax Luminance Molten Moving Multigrid Natural NeuralController
+    Newton NoCutoff Observation Obstacle Optax Optimiser Ordering PairLaw Pairs Positive PowerLaw Preconditioner
+    Progress PullLaw Reconstruction Relaxation ReverseCuthillMcKee Robot RobotSettings Rule RungeKutta4 Sampling Secant
+    SemiImplicit SignedDistance SimulationError Skyline SoftPositive SplitHeat SpringSettings StabilityWarning Stepper
+    StiffnessRule Still Stop StopReason StoreAll StoreStates SymmetricSplitHeat SymplecticEuler Tangent TensionOnly
+    ThermalBoundary Topology Transform Unpreconditioned VelocityVerlet animate batch body_of_cells distance domain
+    elevation_model energy_ledger equilibrium fit_constants fit_springs from_mesh gradient_magnitude impulses load
+    load_image melted_fraction normal_modes pad_nets principal_curvatures push_out raise_for_status save save_trajectory
+    select smoothing_radius stable_dt total_heat train walk
 """
 
 

@@ -14,10 +14,13 @@ import jaxspring as js
 from benchmarks import scenes
 
 from .layouts import Forms, Program, Scene
+from .robots import CHECKED_ROBOTS, PARTS
 
 
 def forms(scene: Scene) -> Forms:
     """One form of each: what the library chooses."""
+    if "robots" in str(scene["kind"]):
+        return {f"chunks of {n}": lambda n=n: robots(scene, n) for n in (16, 64)}
     make = {
         "cloth": positions,
         "mesh": positions,
@@ -138,3 +141,44 @@ def fluid(scene: Scene) -> Program:
     system = js.System(net, 1.0, law)
     state = eqx.filter_jit(lambda s: system.begin(s))(js.State.from_points(net, scene["x"], scene["v"]))
     return kept(lambda n: js.rollout(system, state, js.VelocityVerlet(), scene.number("dt"), n), lambda end: end.state.points)
+
+
+def robots(scene: Scene, chunk: int) -> Program:
+    """`js.robot.distance` of many controllers, or its gradient by all weights, by `js.batch`."""
+    names = {
+        "cell": "size",
+        "node_mass": "mass",
+        "stiffness": "k",
+        **{n: n for n in ("damping", "friction", "gravity", "frequency", "reach", "dt")},
+    }
+    numbers: dict[str, Any] = {name: float(scene[of]) for name, of in names.items()}
+    settings = js.robot.RobotSettings(**numbers)
+    net = js.Graph.from_edges(scene["edges"], len(scene["x"]))
+    robot = js.robot.walking_robot(settings, net=net, points=scene["x"], groups=scene["groups"], dtype=jnp.dtype(jnp.float32))
+    n_nodes, order = net.n_nodes, net.node_permutation.order
+    # The library's network reads nodes in the net's own order, the scene's in that of its points.
+    columns = np.concatenate([np.arange(4), *(4 + d * n_nodes + order for d in range(4))])
+
+    def walked(parts: Any, n_steps: int) -> Any:
+        first, first_bias, second, second_bias = parts
+        like = robot.controller
+        controller = eqx.tree_at(
+            lambda c: (c.first, c.first_bias, c.second, c.second_bias), like, (first[:, columns], first_bias, second, second_bias)
+        )
+        return js.robot.distance(robot, controller, n_steps)
+
+    wanted = jax.grad(walked) if str(scene["kind"]).startswith("gradient") else walked
+    programs: dict[int, Any] = {}
+    weights = tuple(jnp.asarray(scene[name]) for name in PARTS)
+
+    def run(n_steps: int) -> Any:
+        if n_steps not in programs:
+            programs[n_steps] = jax.jit(js.batch(lambda parts: wanted(parts, n_steps), chunk=chunk))
+        return programs[n_steps](weights)
+
+    def last(found: Any) -> Any:
+        if not isinstance(found, tuple):
+            return found
+        return np.concatenate([np.asarray(part)[:CHECKED_ROBOTS].reshape(CHECKED_ROBOTS, -1) for part in found], axis=1)
+
+    return kept(run, last)

@@ -30,6 +30,10 @@ def forms(scene: Scene) -> Forms:
             found[f"nodes, {way}"] = lambda way=way: make[kind](scene, way)
             found[f"springs, {way}"] = lambda way=way: over_springs(scene, way)
         return found
+    if "robots" in kind:
+        from . import taichi_robot
+
+        return taichi_robot.forms(scene)
     return {"springs, tape": lambda: gradient(scene)}
 
 

@@ -104,7 +104,7 @@ class Rule(eqx.Module):
     """What happens to a state after each step, besides motion. Abstract.
 
     Rules run in the order in which the system names them, each on the state that the one before left; then all obstacles, together; then
-    those that watch. A stepper is told where a rule may have changed positions or velocities (`moves`).
+    those that drive; then those that watch. A stepper is told where a rule may have changed positions or velocities (`moves`).
 
     What it must know from step to step it gives in `remember`, reads by `recall` and writes by `keep`.
 
@@ -114,6 +114,8 @@ class Rule(eqx.Module):
         sets_temperature: whether it changes temperatures: it is named where one is NaN or infinite (class attribute).
         moves: whether it may change positions or velocities (class attribute).
         breaks: whether it may change which springs hold, or their rest lengths (class attribute).
+        drives: whether it acts after the obstacles, on the state in which the next step begins, and changes neither positions nor
+            velocities: it gives commands that hold for a step (class attribute).
         watches: whether it acts last, and is told by `Step.stages` what all the others did (class attribute).
         place: which part of its system it is, once bound: its index in a status and in `state.memory` (static).
     """
@@ -123,12 +125,18 @@ class Rule(eqx.Module):
     moves: ClassVar[bool] = True
     breaks: ClassVar[bool] = True
     sets_temperature: ClassVar[bool] = False
+    drives: ClassVar[bool] = False
     watches: ClassVar[bool] = False
     place: int | None = eqx.field(static=True, init=False, default=None)
 
     def __str__(self) -> str:
         """A line for a person."""
         return printing.effect(self)
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether, as it was made, it does nothing after a step and remembers nothing, though its class can."""
+        return False
 
     def check(self, scene: Scene) -> None:
         """Raise ValueError where it does not fit the system. Called when the system is made, and when it is bound."""
@@ -296,12 +304,12 @@ def _placed(part: Any, place: int) -> Any:
 
 def acts(part: Rule) -> bool:
     """Whether it does something after a step."""
-    return type(part).update is not Rule.update
+    return type(part).update is not Rule.update and not part.is_idle
 
 
 def remembers(part: Rule) -> bool:
     """Whether it may remember something."""
-    return type(part).remember is not Rule.remember
+    return type(part).remember is not Rule.remember and not part.is_idle
 
 
 def any_refused(*values: Any) -> Array:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import abc
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -19,15 +19,17 @@ from jax.typing import DTypeLike
 from jaxtyping import Array
 
 from .._arrays import whole_number
-from .._checks import finite, is_concrete, nonnegative, positive
+from .._checks import finite, is_concrete, kind, nonnegative, positive
 from ..linalg.operators import Blocks, SpringBlocks
 from ..numerics import cast_inexact, tiny
 from ..state import State
+from ..status import Status
 from ..topology.base import Topology
 from ..topology.edge_field import EdgeField, SpringNumbers, ZeroOutside
 from ..topology.periods import box_of
 from ..vector import Vector
-from .base import Finding, Force, Scene, any_refused
+from .actuation import Actuation
+from .base import Finding, Force, Scene, Step, any_refused
 from .history import has_yielded, lengthened, weakened
 from .in_box import along_axes, check_rest_length, long_springs, turned_springs
 from .laws import Hooke, Law, PowerLaw, TensionOnly, length_of, spring_block, spring_energy, spring_pull
@@ -85,6 +87,7 @@ class Springs(Force):
         axes: the coordinates the springs act in (None: all). `axes=(0, 1)` makes springs of the projection on the plane.
         allow_negative_stiffness: accept stiffnesses below zero, which push without bound.
         expansion: an `ExpansionRule` that multiplies the rest lengths, or None.
+        actuation: an `Actuation` that multiplies them by commands, which hold for a step, or None.
 
     A state whose `alive` or `rest_length` is of this net's springs is heeded: a broken spring does nothing, whatever its constants are, and
     rest lengths that have changed take the place of the given ones.
@@ -94,6 +97,9 @@ class Springs(Force):
             rest length that no image of the net's box can have.
     """
 
+    moves: ClassVar[bool] = False
+    breaks: ClassVar[bool] = False
+    drives: ClassVar[bool] = True
     net: Topology
     stiffness: Any
     rest_length: Any
@@ -101,6 +107,7 @@ class Springs(Force):
     axes: tuple[int, ...] | None = eqx.field(static=True)
     allow_negative_stiffness: bool = eqx.field(static=True)
     expansion: ExpansionRule | None
+    actuation: Actuation | None
 
     def __init__(
         self,
@@ -111,6 +118,7 @@ class Springs(Force):
         axes: tuple[int, ...] | None = None,
         allow_negative_stiffness: bool = False,
         expansion: ExpansionRule | None = None,
+        actuation: Actuation | None = None,
     ):
         self.net = net
         self.stiffness = stiffness if isinstance(stiffness, StiffnessRule) else _edge_constant(net, "stiffness", stiffness)
@@ -121,6 +129,9 @@ class Springs(Force):
             raise ValueError(f"axes = {self.axes}; expected different coordinates out of 0 (x), 1 (y), 2 (z), e.g. (0, 1).")
         self.allow_negative_stiffness = allow_negative_stiffness
         self.expansion = expansion
+        self.actuation = actuation
+        if actuation is not None:
+            kind("actuation", actuation, Actuation, "Actuation(controller)").check(net)
         if not isinstance(stiffness, StiffnessRule):
             why = "A negative stiffness pushes without bound. Pass allow_negative_stiffness=True if meant."
             _check_sign("stiffness", self.stiffness, why, any_sign=allow_negative_stiffness)
@@ -139,7 +150,23 @@ class Springs(Force):
             stiffness = vanishing(self.net, cast_inexact(stiffness, scene.dtype))
         rest_length = cast_inexact(self.net.edge_field(self.rest_length, "rest_length"), scene.dtype)
         rest_length = self.net.at_ends(rest_length) if isinstance(rest_length, EdgeField) else rest_length
-        return cast_inexact(eqx.tree_at(lambda s: (s.stiffness, s.rest_length), self, (stiffness, rest_length)), scene.dtype)
+        actuation = None if self.actuation is None else self.actuation.bind(self.net, scene.dtype)
+        bound = (stiffness, rest_length, actuation)
+        made = eqx.tree_at(lambda s: (s.stiffness, s.rest_length, s.actuation), self, bound, is_leaf=lambda leaf: leaf is None)
+        return cast_inexact(made, scene.dtype)
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether nobody drives them."""
+        return self.actuation is None
+
+    def remember(self, state: State) -> Array | None:
+        """The command in force, as its controller gives it; None where nobody drives them."""
+        return None if self.actuation is None else self.actuation.command(self.net, state)
+
+    def update(self, step: Step, state: State) -> tuple[State, Status]:
+        """The state with the command of the next step."""
+        return (state if self.actuation is None else self.keep(state, self.remember(state))), Status.ok()
 
     def force(self, state: State) -> Vector:
         """Sum of the pulls at each node [N]."""
@@ -187,7 +214,8 @@ class Springs(Force):
     @property
     def can_feed(self) -> bool:
         """Whether stiffness or rest length follow the state, or the law has no potential."""
-        return isinstance(self.stiffness, StiffnessRule) or self.expansion is not None or not self.has_potential
+        is_driven = self.expansion is not None or self.actuation is not None
+        return isinstance(self.stiffness, StiffnessRule) or is_driven or not self.has_potential
 
     def tension(self, state: State) -> EdgeField:
         """Pull of each spring along itself [N]: positive stretched, negative squeezed, zero broken. `net.flatten` gives (E,)."""
@@ -242,8 +270,10 @@ class Springs(Force):
             bad = bad | any_refused(box_of(self.net))
         by_rule = rule.invalid() if isinstance(rule, StiffnessRule) else None
         bad = bad if by_rule is None else bad | by_rule
-        by_expansion = None if self.expansion is None else self.expansion.invalid()
-        return bad if by_expansion is None else bad | by_expansion
+        for driver in (self.expansion, self.actuation):
+            by_driver = None if driver is None else driver.invalid()
+            bad = bad if by_driver is None else bad | by_driver
+        return bad
 
     def rounding(self, state: State) -> Array | None:
         """The largest coordinate's rounding over the smallest rest or present length. Springs without rest length pull by k d, whose
@@ -268,13 +298,21 @@ class Springs(Force):
         return lengthened(self.net, state, self.unyielded_length(state))
 
     def unyielded_length(self, state: State) -> Array | EdgeField:
-        """Rest length without yielding [m]: the state's own where it has one, else the given one, times the expansion."""
+        """Rest length without yielding [m]: the state's own where it has one, else the given one, times `growth`."""
         changed = state.rest_length_of(self.net)
         l: Any = changed if changed is not None else cast_inexact(self.net.edge_field(self.rest_length, "rest_length"), state.dtype)
-        if self.expansion is None:
-            return l
-        factor = self.net.edge_field(cast_inexact(self.expansion, state.dtype).factor(self.net, state), "factor")
-        return map_living(self.net, state, lambda l, factor: l * factor, l, factor)
+        growth = self.growth(state)
+        return l if growth is None else map_living(self.net, state, lambda l, factor: l * factor, l, growth)
+
+    def growth(self, state: State) -> Array | EdgeField | None:
+        """Expansion times actuation of each spring in this state; None where there is neither."""
+        factor: Any = None
+        if self.expansion is not None:
+            factor = self.net.edge_field(cast_inexact(self.expansion, state.dtype).factor(self.net, state), "factor")
+        if self.actuation is None:
+            return factor
+        command = self.actuation.factor(self.net, self.recall(state))
+        return command if factor is None else map_living(self.net, state, lambda a, b: a * b, factor, command)
 
     def present_stiffness(self, state: State) -> Array | EdgeField:
         """Stiffness of each spring in this state [N/m]: the given one, or that of its rule, less what tearing has taken of it."""

@@ -115,8 +115,9 @@ class Adam(Optimiser):
         b1: decay of the mean gradient per iteration (static).
         decay_over: iterations over which the rate falls; None keeps it (static). A resumed fit may change it, to go on for longer.
         last_fraction: what is left of the rate then (static).
+        largest_norm: longer gradients are shortened to this norm; None takes them as they are (static).
 
-    Source: optax.adam, optax.cosine_decay_schedule.
+    Source: optax.adam, optax.cosine_decay_schedule, optax.clip_by_global_norm.
     """
 
     may_change: ClassVar[frozenset[str]] = frozenset({"decay_over"})
@@ -125,12 +126,14 @@ class Adam(Optimiser):
     b1: float = eqx.field(static=True, default=0.9)
     decay_over: int | None = eqx.field(static=True, default=None)
     last_fraction: float = eqx.field(static=True, default=0.05)
+    largest_norm: float | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
         _expect("learning_rate", self.learning_rate, self.learning_rate > 0, "a positive number")
         _expect("b1", self.b1, 0 <= self.b1 < 1, "zero or more, and less than one")
         _expect("decay_over", self.decay_over, self.decay_over is None or self.decay_over >= 1, "1 or more iterations, or None")
         _expect("last_fraction", self.last_fraction, self.last_fraction >= 0, "zero or more")
+        _expect("largest_norm", self.largest_norm, self.largest_norm is None or self.largest_norm > 0, "a positive number, or None")
 
     def init(self, objective: Objective, free: PyTree, carried: PyTree) -> PyTree:
         """Mean gradient, mean square, count."""
@@ -144,7 +147,8 @@ class Adam(Optimiser):
         rate: Any = self.learning_rate
         if self.decay_over:
             rate = optax.cosine_decay_schedule(self.learning_rate, self.decay_over, self.last_fraction)
-        return Optax(optax.adam(rate, b1=self.b1))
+        adam = optax.adam(rate, b1=self.b1)
+        return Optax(adam if self.largest_norm is None else optax.chain(optax.clip_by_global_norm(self.largest_norm), adam))
 
 
 class LBFGS(Optimiser):

@@ -30,9 +30,8 @@ class Stepper(eqx.Module):
         """The state one `dt` [s] later, and what to carry. The caller sets the new state's time."""
 
     def after_rules(self, system: BoundSystem, before: State, moved: State, now: State, dt: Array, memory: Any) -> Any:
-        """What to carry where rules have changed positions, velocities or springs: the step began at `before`, motion ended at `moved`,
-        rules left `now`. A stepper that carries what belongs to a place, a velocity or a spring makes it anew; called only where a rule
-        may change them.
+        """What to carry where rules have changed positions, velocities, springs or commands: the step began at `before`, motion ended at
+        `moved`, rules left `now`. A stepper that carries what belongs to these makes it anew; called only where a rule may change them.
         """
         return memory
 

@@ -280,8 +280,9 @@ def _push(system: BoundSystem, like: Vector) -> Vector:
 @eqx.filter_jit
 def _find(search: _Search, system: System, state: State) -> Equilibrium:
     ready = system.bind(state.dtype)
-    # A cache is kept up to date by rollout alone: without it each evaluation makes its own. Histories are held.
-    start = ready.alone(state)
+    # A cache is kept up to date by rollout alone: without it each evaluation makes its own. Histories are held,
+    # and so are the commands of this state.
+    start = ready.commanded(ready.alone(state))
     # Free nodes end at the same place wherever they start; only held ones carry a derivative.
     anchor = ready.matrix(Blocks(), start).pick(stopped(start.position), start.position)
     scene = _Scene(ready, start.moved(anchor, Vector.zeros_like(anchor)))

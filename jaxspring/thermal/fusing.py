@@ -129,8 +129,8 @@ class Fusing(Breaking):
             lambda whole, theta, l: ~whole & (theta <= cold) & (theta < melting) & (l <= reach), alive, warm, length
         )
         natural = length
-        if self.springs is not None and self.springs.expansion is not None:
-            factor = self.springs.expansion.factor(self.net, state)
+        factor = None if self.springs is None else self.springs.growth(state)
+        if factor is not None:
             natural = self.net.map_springs(lambda l, f: l / jnp.where(f > 0, f, jnp.ones_like(f)), length, factor)
         rest = self.net.map_springs(jnp.where, back, natural, state.rest_length_of(self.net))
         return state.with_alive(self.net, self.net.map_springs(jnp.logical_or, alive, back)).with_rest_length(self.net, rest), refused

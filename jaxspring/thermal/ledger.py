@@ -9,6 +9,8 @@ v is the velocity before the step, v'' the one after motion and all rules: what 
 that step. With symplectic Euler the kicks of forces and rules sum to the change of kinetic energy exactly. All entries together are the
 change of the columns to rounding. Momentum is kept alike: what motion and each rule gave.
 
+Commands of driven springs change between steps, while nothing moves: what that changes of the potential is the actuators' work.
+
 An impact counts as what it takes of the kinetic energy there, m (e^2 - 1) (n . w)^2 / 2, and as friction: the rest of the step that it
 splits is motion. A node at rest on a floor, which falls g dt^2 in each step and is put back, books nothing.
 
@@ -47,6 +49,7 @@ class Account(eqx.Module):
         motion: (2 + F,) what the columns changed by motion [J].
         rules: (R, 2 + F) what each rule changed [J]; those that watch, such as a ledger, change nothing.
         impulses: (1 + R, D) momentum given by motion and by each rule [kg m/s].
+        driven: (F,) work of the actuators of each force [J]; None where there are none.
     """
 
     start: Array
@@ -55,6 +58,7 @@ class Account(eqx.Module):
     motion: Array
     rules: Array
     impulses: Array
+    driven: Array | None = None
 
 
 class Ledger(Rule):
@@ -97,15 +101,20 @@ class Ledger(Rule):
         forces, rules = self._parts()
         now, (n, r) = self.columns(state), (len(forces), len(rules))
         work, books = jnp.zeros(n, state.dtype), jnp.zeros((r, n + 2), state.dtype)
-        return Account(now, now, work, jnp.zeros_like(now), books, jnp.zeros((1 + r, state.dim), state.dtype))
+        driven = jnp.zeros_like(work) if any(force.drives and not force.is_idle for force in forces) else None
+        return Account(now, now, work, jnp.zeros_like(now), books, jnp.zeros((1 + r, state.dim), state.dtype), driven)
 
     def update(self, step: Step, state: State) -> tuple[State, Status]:
         """The state with the step in the books."""
         account: Account = self.recall(state)
         forces, rules = self._parts()
-        before = step.before
+        before, driven = step.before, account.driven
         stages, columns, places = [before, step.moved], [account.now, self.columns(step.moved)], [-1]
         for place, after in step.stages:
+            if 0 <= place < len(forces):
+                columns.append(self.columns(after, columns[-1]))
+                driven = driven if driven is None else driven.at[place].add(jnp.sum(columns[-1] - columns[-2]))
+                continue
             row = place - len(forces) if place >= 0 else -1
             is_still = row >= 0 and not (rules[row].moves or rules[row].breaks)
             columns.append(self.columns(after, columns[-1] if is_still else None))
@@ -122,7 +131,8 @@ class Ledger(Rule):
         if step.impacts is not None:
             books, motion, momenta = self._by_obstacle(state, step.impacts, books, motion, momenta)
         work = account.work + self._work(before, mean, step.dt)
-        new = Account(account.start, columns[-1], work, account.motion + motion, account.rules + books, account.impulses + momenta)
+        books, momenta = account.rules + books, account.impulses + momenta
+        new = Account(account.start, columns[-1], work, account.motion + motion, books, momenta, driven)
         return self.keep(state, new), Status.ok()
 
     def _by_obstacle(self, state: State, struck: Books, books: Array, motion: Array, momenta: Array) -> tuple[Array, Array, Array]:
@@ -197,9 +207,9 @@ def energy_ledger(system: Any, state: State, which: int = 0) -> dict[str, Any]:
         which: the ledger that is meant, where there are several.
 
     Returns:
-        `start`, `end`: energy by column [J]. `work`: of drag and forces without potential [J]. `rules`: what each rule changed, by column
-        [J]. `integration`: the stepper's own error [J]. `residual`: what is left, rounding [J]. `impulses`: momentum that motion and each
-        rule gave [kg m/s].
+        `start`, `end`: energy by column [J]. `work`: of drag, of forces without potential and of actuators [J]. `rules`: what each rule
+        changed, by column [J]. `integration`: the stepper's own error [J]. `residual`: what is left, rounding [J]. `impulses`: momentum
+        that motion and each rule gave [kg m/s].
 
     Raises:
         ValueError: no ledger in the system, or none in the state.
@@ -217,6 +227,7 @@ def energy_ledger(system: Any, state: State, which: int = 0) -> dict[str, Any]:
     )
     impulses = np.asarray(account.impulses, np.float64).tolist()
     integration = float(np.sum(motion) - np.sum(work))
+    work = work if account.driven is None else work + np.asarray(account.driven, np.float64)
 
     def named(values: np.ndarray) -> dict[str, float]:
         return dict(zip(columns, map(float, values), strict=True))

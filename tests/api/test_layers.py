@@ -57,6 +57,7 @@ LAYERS = {
     "export": 7,  # files for viewers
     "scenes": 8,
     "reconstruction": 8,  # public names of a scene
+    "robot": 8,  # public names of a scene and of what drives it
     "cli": 8,
     "__main__": 9,
     "__init__": 9,  # the public names

@@ -270,9 +270,9 @@ def test_a_matrix_with_stored_zeros_and_small_types():
     row, column = [0, 0, 1, 1, 2], [1, 1, 0, 0, 1]
     matrix = scipy.sparse.coo_array((np.array([200, 100, 200, 100, 0], np.uint8), (row, column)), shape=(3, 3))
     for stored in (matrix, matrix.T):
-        net, weights = js.from_scipy(stored)
+        net, weights = js.topology.from_scipy(stored)
         assert (net.edges.tolist(), weights.tolist()) == ([[0, 1], [1, 2]], [300.0, 0.0])
-    net, weights = js.from_scipy(np.array([[False, True], [True, False]]))
+    net, weights = js.topology.from_scipy(np.array([[False, True], [True, False]]))
     assert (net.n_springs, weights.tolist()) == (1, [1.0])
 
 
@@ -287,23 +287,23 @@ def test_a_matrix_with_stored_zeros_and_small_types():
 def test_a_matrix_without_numbers(matrix, error, text):
     """Complex, missing and masked weights are refused."""
     with pytest.raises(error, match=text):
-        js.from_scipy(matrix)
+        js.topology.from_scipy(matrix)
 
 
 def test_networkx_attributes():
     """One name is one attribute; None, text, NaN and a missing attribute are refused by edge, also among keys of mixed kinds."""
     graph = networkx.Graph()
     graph.add_edge("a", 1, stiffness=3.0)
-    assert js.from_networkx(graph, "stiffness")[2][0].tolist() == [3.0]
+    assert js.topology.from_networkx(graph, "stiffness")[2][0].tolist() == [3.0]
     for value, error in ((None, TypeError), ("3", TypeError), (np.nan, ValueError), ([1.0, 2.0], TypeError)):
         graph["a"][1]["stiffness"] = value
         with pytest.raises(error, match=r"stiffness.*edge \('a', 1\)|edge \('a', 1\).*stiffness"):
-            js.from_networkx(graph, ("stiffness",))
+            js.topology.from_networkx(graph, ("stiffness",))
     graph["a"][1][7] = 1.0
     with pytest.raises(ValueError, match="has no attribute 'mass'; it has 'stiffness', 7"):
-        js.from_networkx(graph, ("mass",))
+        js.topology.from_networkx(graph, ("mass",))
     with pytest.raises(TypeError, match=r"expected a networkx\.Graph"):
-        js.from_networkx([(0, 1)])
+        js.topology.from_networkx([(0, 1)])
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -1.0])

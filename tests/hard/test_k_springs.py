@@ -485,7 +485,7 @@ def instances():
         None,
         "",
     )
-    pixels = js.reconstruction.PixelSprings(None, 1.0)
+    pixels, robot = js.reconstruction.PixelSprings(None, 1.0), js.robot.walking_robot(js.robot.RobotSettings(body=("#",)))
     field = TWO.edge_field(jnp.ones(1))
     classes = [
         js.thermal.Account(number, number, number, number, number, number),
@@ -641,6 +641,8 @@ def instances():
             js.plasticity.Onset(whole, whole, number),
         ),
         *(js.plasticity.Yielded(field, field, field), js.plasticity.Torn(field, None, None)),
+        *(robot, robot.settings, robot.controller, js.robot.body_of_cells(("#",), 1.0)),
+        *(js.robot.Oscillators([0.1], [0.0], 1.0), js.robot.Actuation(js.robot.Oscillators([0.1], [0.0], 1.0), [0])),
     ]
     return {type(a).__name__: a for a in classes}
 

@@ -1,0 +1,1 @@
+"""A soft robot that learns to walk."""

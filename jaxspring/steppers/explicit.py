@@ -75,7 +75,7 @@ class VelocityVerlet(Stepper):
         return state.moved(x, state.velocity + (0.5 * dt) * (a + a_new)), a_new
 
     def after_rules(self, system: BoundSystem, before: State, moved: State, now: State, dt: Array, memory: Vector) -> Vector:
-        """The acceleration where the rules have left nodes and springs, made anew in steps in which they changed any, or gave other commands."""
+        """The acceleration where the rules have left nodes and springs, made anew where they changed any, or gave commands."""
         if system.is_driven:
             return system.acceleration(now)
         pairs = [*zip(now.position, moved.position, strict=True), *zip(now.velocity, moved.velocity, strict=True)]

@@ -104,7 +104,8 @@ def kind(name: str, value: Any, expected: type, example: str) -> Any:
     if isinstance(value, type):
         raise TypeError(f"{name} is the class {value.__name__}; expected a {expected.__name__}. Make one: {example}.")
     if not isinstance(value, expected):
-        raise TypeError(f"{name} is {value!r:.60}, a {type(value).__name__}; expected a {expected.__name__}, e.g. {example}.")
+        shown = " ".join(repr(value).split())
+        raise TypeError(f"{name} is {shown:.60}, a {type(value).__name__}; expected a {expected.__name__}, e.g. {example}.")
     return value
 
 

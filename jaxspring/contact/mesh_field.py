@@ -3,8 +3,8 @@
     inside the grid    the spline through the samples: two continuous derivatives
     outside it         sqrt(o**2 + d**2), o: distance to the grid, d: sampled at its nearest place; no more than the true distance
 
-Edges and corners are rounded over about one spacing: there the error is up to a fifth of it, and a fiftieth in the middle of faces. Thin
-parts need several samples across.
+Edges and corners are rounded over about one spacing: there the error is up to a fifth of it, and a fiftieth in the middle of faces; the
+gradient is up to 1.3 long outside of an edge, and 1.4 inside where two faces are as near. Thin parts need several samples across.
 
 Source: `mesh_distance.py` for the samples; the spline as in `images/sampling.py`.
 """

@@ -61,7 +61,7 @@ class NodeContact(Force):
 
     >>> net = js.Graph.from_edges(np.zeros((0, 2), int), 2)
     >>> system = js.System(net, mass=1.0, forces=NodeContact(net, radius=0.5, stiffness=100.0, onset=0.1))
-    >>> print(system.force(js.State.from_points(net, [[0.0, 0.0], [0.75, 0.0]])).x)
+    >>> print(system.force(js.State.from_points(net, [[0.0, 0.0], [0.75, 0.0]])).x.round(3))
     [-20.  20.]
     """
 

@@ -226,7 +226,13 @@ def test_a_mesh_that_is_a_box():
         assert error.max() < 0.22 * 0.2
         assert np.median(error) < 0.02 * 0.2
         assert ((np.asarray(d) < 0) == (np.asarray(exact) < 0))[np.abs(exact) > 0.04].all()
-        assert np.linalg.norm(rows(normal)[is_near], axis=1).max() < 1.2
+        # A spline overshoots beside kinks: edges outside, and inside the ridge that is as far from two faces.
+        steepness, is_outside = np.linalg.norm(rows(normal), axis=1), np.asarray(exact) > 0
+        assert steepness[is_near & is_outside].max() < 1.3
+        assert steepness[is_near].max() < 1.5
+        in_the_middle = is_near & (np.sort(np.abs(points), axis=1)[:, 1] < 0.5)
+        assert in_the_middle.sum() > 50
+        np.testing.assert_allclose(steepness[in_the_middle], 1, atol=0.02)
     d, *_ = looked_at(mesh, 20 * points)
     true = np.asarray(EXACT["box"][0].__class__((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)).distance(vector(20 * points), NOW))
     assert (np.asarray(d) <= true + 0.02).all()
@@ -269,7 +275,7 @@ def test_a_height_field():
     d, n, *_ = looked_at(slope, points)
     np.testing.assert_allclose(d, points @ normal, atol=1e-13)
     np.testing.assert_allclose(rows(n), np.tile(normal, (N, 1)), atol=1e-13)
-    np.testing.assert_allclose(looked_at(slope, np.array([[-5.0, 0.0, 2.0]]))[0], 2.0)
+    np.testing.assert_allclose(looked_at(slope, np.array([[-5.0, -3.0, 2.0]]))[0], 2.0)
 
     # The upper part of a ball of radius 5 about (4, 3, -4).
     hill = c.HeightField(js.Image(np.sqrt(25 - (x - 4) ** 2 / 2 - (y - 3) ** 2 / 2) - 4))

@@ -29,6 +29,8 @@ from .mesh_distance import grid_distance
 
 # The grid reaches this many spacings beyond the mesh: the spline of the surface's own cells then knows both sides.
 MARGIN = 3
+# So many samples more take part in finding the spline; what its end does falls to a quarter with each.
+BEYOND = 10
 # Samples beyond which a grid is refused: 128 MiB in float64.
 MOST_SAMPLES = 2**24
 
@@ -161,10 +163,14 @@ def _check_closed(triangles: np.ndarray) -> None:
 
 
 def _spline(samples: np.ndarray) -> np.ndarray:
-    """Coefficients of the cubic spline through the samples, mirrored about the outermost, with one more at each side."""
+    """Coefficients of the cubic spline through the samples, with one more at each side. Beyond the outermost they go on along their slope:
+    a spline that ends level would swing about a distance, which does not.
+    """
     from scipy.ndimage import spline_filter
 
-    return np.pad(spline_filter(samples, order=3, output=np.float64, mode="mirror"), 1, mode="reflect")
+    wide = np.pad(samples, BEYOND, mode="reflect", reflect_type="odd")
+    inner = slice(BEYOND - 1, 1 - BEYOND)
+    return spline_filter(wide, order=3, output=np.float64, mode="mirror")[inner, inner, inner]
 
 
 __all__ = ["MeshField"]

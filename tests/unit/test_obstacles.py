@@ -230,9 +230,10 @@ def test_a_mesh_that_is_a_box():
         steepness, is_outside = np.linalg.norm(rows(normal), axis=1), np.asarray(exact) > 0
         assert steepness[is_near & is_outside].max() < 1.3
         assert steepness[is_near].max() < 1.5
-        in_the_middle = is_near & (np.sort(np.abs(points), axis=1)[:, 1] < 0.5)
-        assert in_the_middle.sum() > 50
-        np.testing.assert_allclose(steepness[in_the_middle], 1, atol=0.02)
+        # A spacing before the middle of a face the distance is straight, up to the end of the samples.
+        before_a_face = (np.asarray(exact) > 0.2) & (np.asarray(exact) < 0.6) & (np.sort(np.abs(points), axis=1)[:, 1] < 0.5)
+        assert before_a_face.sum() > 50
+        np.testing.assert_allclose(steepness[before_a_face], 1, atol=0.01)
     d, *_ = looked_at(mesh, 20 * points)
     true = np.asarray(EXACT["box"][0].__class__((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)).distance(vector(20 * points), NOW))
     assert (np.asarray(d) <= true + 0.02).all()

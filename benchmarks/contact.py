@@ -6,7 +6,7 @@ A sheet of 1e2 to 1e5 nodes with structural and shear springs and weight, in spa
 obstacle, so that about half of the nodes touch. One row for each obstacle, as a penalty without and with damper and friction; `Floor`, the
 rule that splits the step at an impact; contact of nodes with nodes by a list.
 
-Read: `ns` is what the obstacle adds to a step, per node; `ratio` the whole step over the bare one, the median of interleaved rounds; and
+Read: ns is what the obstacle adds to a step, per node; `ratio` the whole step over the bare one, the median of interleaved rounds; and
 the same for the gradient of the squared places by the start. `touch` is the share of nodes inside, `error` the largest difference of the
 obstacle's force from float64, over the largest force. Draws the ratios.
 

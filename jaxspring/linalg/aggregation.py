@@ -16,8 +16,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..topology.permutation import locality_order
-
 # Share of the neighbours' average in P: the usual 2/3.
 _SHARE = 2 / 3
 # Groups that a node may belong to: near a hub there could be thousands, and a coarse spring for each pair of them.
@@ -41,14 +39,14 @@ class Coarser(NamedTuple):
 
 
 def coarser(springs: Springs) -> Coarser:
-    """Group the nodes of a net."""
+    """Group the nodes of a net in the order of their numbers: where neighbours have near ones, groups lie close together, and are few."""
     from scipy.sparse import csr_array, diags_array
 
     tails, heads, n = springs
     ones = np.ones(2 * len(tails))
     neighbours = csr_array((ones, (np.concatenate([tails, heads]), np.concatenate([heads, tails]))), shape=(n, n))
-    order = locality_order(np.stack([tails, heads], axis=-1), n)
-    group = _groups([int(i) for i in neighbours.indptr], [int(j) for j in neighbours.indices], [int(i) for i in order])
+    neighbours.sort_indices()
+    group = _groups([int(i) for i in neighbours.indptr], [int(j) for j in neighbours.indices], n)
     n_groups = int(group.max(initial=-1)) + 1
     inside = group >= 0
     member = csr_array((np.ones(inside.sum()), (np.flatnonzero(inside), group[inside])), shape=(n, n_groups))
@@ -63,14 +61,18 @@ def coarser(springs: Springs) -> Coarser:
     return Coarser(springs, spread, combination)
 
 
-def _groups(start: list[int], neighbour: list[int], order: list[int]) -> np.ndarray:
-    """(n,) group of each node, -1 for a node without springs. Nodes whose neighbours are all free found groups; the rest joins one.
+def coarser_by(order: np.ndarray, springs: Springs) -> Coarser:
+    """The same of a net whose nodes are kept in another order: node `order[i]` is asked as number i."""
+    number = np.argsort(order)
+    found = coarser(Springs(number[springs.tails], number[springs.heads], springs.n))
+    return found._replace(spread=found.spread[number])
 
-    Asked in an order in which neighbours are near: groups then lie close together, and are few.
-    """
-    group = [-1] * len(order)
+
+def _groups(start: list[int], neighbour: list[int], n: int) -> np.ndarray:
+    """(n,) group of each node, -1 for a node without springs. Nodes whose neighbours are all free found groups; the rest joins one."""
+    group = [-1] * n
     count = 0
-    for i in order:
+    for i in range(n):
         around = neighbour[start[i] : start[i + 1]]
         if group[i] < 0 and around and all(group[j] < 0 for j in around):
             group[i] = count
@@ -78,7 +80,7 @@ def _groups(start: list[int], neighbour: list[int], order: list[int]) -> np.ndar
                 group[j] = count
             count += 1
     founded = list(group)
-    for i in order:
+    for i in range(n):
         if group[i] < 0:
             group[i] = next((founded[j] for j in neighbour[start[i] : start[i + 1]] if founded[j] >= 0), -1)
     return np.asarray(group)
@@ -118,4 +120,4 @@ def _combined(difference: Any, n_groups: int) -> tuple[Springs, Any]:
     return Springs(pair // n_groups, pair % n_groups, n_groups), combination
 
 
-__all__ = ["Coarser", "Springs", "coarser"]
+__all__ = ["Coarser", "Springs", "coarser", "coarser_by"]

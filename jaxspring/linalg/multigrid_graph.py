@@ -18,8 +18,9 @@ from jaxtyping import Array, Int
 from ..topology.base import Topology
 from ..topology.graph import Graph
 from ..topology.lattice import Lattice
+from ..topology.permutation import locality_order
 from ..vector import Vector
-from .aggregation import Springs, coarser
+from .aggregation import Springs, coarser, coarser_by
 from .multigrid_cycle import Hierarchy, Level
 from .operators import SpringBlocks, SpringMatrix
 from .positive import as_rows, free_coordinates, node_blocks, spring_blocks
@@ -114,7 +115,7 @@ class GraphHierarchy(Hierarchy):
         springs = [Springs(*_ends(net), net.n_nodes)]
         steps = []
         while springs[-1].n > most_nodes:
-            steps.append(coarser(springs[-1]))
+            steps.append(coarser(springs[-1]) if steps else coarser_by(_near_order(net), springs[0]))
             springs.append(steps[-1].springs)
         drafts = [_Tables.of(s) for s in springs[:-1]]
         orders = [*(draft.order for draft in drafts), np.arange(springs[-1].n)]
@@ -216,6 +217,12 @@ def _ends(net: Topology) -> tuple[np.ndarray, np.ndarray]:
     if isinstance(net, Graph):
         return np.asarray(net.ends.tails), np.asarray(net.ends.heads)
     return net.edges[:, 0], net.edges[:, 1]
+
+
+def _near_order(net: Topology) -> np.ndarray:
+    """An order of the nodes as they are stored in which neighbours are near. A graph keeps them by their number of springs."""
+    order = locality_order(net.edges, net.n_nodes)
+    return net.nodes.inverse[order] if isinstance(net, Graph) else order
 
 
 def _is_on(term: SpringBlocks, net: Topology) -> bool:

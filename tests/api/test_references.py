@@ -14,6 +14,7 @@ ELSEWHERE = {
     "benchmarks/results/": "the folder that benchmarks write",
     "JAX_COMPILATION_CACHE_DIR": "a variable that JAX reads",
     "XLA_FLAGS=--xla_cpu_max_isa=AVX2": "a variable that XLA reads",
+    "heartbeat_timeout_seconds": "an argument of jax.distributed.initialize",
     "fn": "a field of diffrax.SaveAt",
     "root_finder": "a field of diffrax.Event",
     "run.pvd": "a file that save_vtk names after the user's folder",

@@ -1,4 +1,4 @@
-"""Hard case L10: sheets that touch at rest stay at rest, a folded sheet keeps its thickness, and the cost grows with the nodes."""
+"""Hard case L10: sheets that touch at rest stay at rest, a folded sheet keeps its thickness, and a list serves many nodes."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import jaxspring as js
-from jaxspring.progress import Stopwatch
 
 c = js.contact
 
@@ -66,23 +65,17 @@ def test_l10_a_folded_sheet_keeps_its_thickness():
 
 
 @pytest.mark.slow
-def test_l10_the_cost_is_linear():
-    """Sixteen times the nodes, 1e4, take about sixteen times as long by a list; all pairs would take 256 times."""
-
-    def program(n):
-        net = js.lattice((n, n))
-        points = np.c_[net.grid(1.0), np.zeros(n * n)]
-        contact = c.NodeContact(net, 0.45, 100.0, rest=points, pairs=js.fluid.NeighbourList(12, 0.2))
-        system = js.System(net, 1.0, contact).bind(jnp.float32)
-        state = jax.jit(lambda system, state: system.begin(state))(system, js.State.from_points(net, points.astype(np.float32)))
-        force = jax.jit(lambda system, state: system.force(state))
-        jax.block_until_ready(force(system, state))
-        return lambda: jax.block_until_ready(force(system, state))
-
-    programs, times = (program(25), program(100)), ([], [])
-    for _ in range(15):
-        for run, taken in zip(programs, times, strict=True):
-            clock = Stopwatch()
-            run()
-            taken.append(clock.seconds)
-    assert min(times[1]) < 48 * min(times[0])
+@pytest.mark.parametrize(("capacity", "serves"), [(128, True), (16, False)])
+def test_l10_a_sheet_of_1e4_nodes(capacity, serves):
+    """A list with room enough serves a large sheet, so that each node looks at so many others at most; one that is too small says what it
+    needs, which is more than the four that are near: the cells of a list fill space, and those of a sheet are few.
+    """
+    net = js.lattice((100, 100))
+    points = np.c_[net.grid(1.0), np.zeros(net.n_nodes)].astype(np.float32)
+    contact = c.NodeContact(net, 0.45, 100.0, rest=points, pairs=js.fluid.NeighbourList(capacity, 0.2))
+    system = js.System(net, 1.0, contact).bind(jnp.float32)
+    begun = jax.jit(lambda system, state: system.begin(state))(system, js.State.from_points(net, points))
+    (found,) = system.forces[0].diagnose(begun)
+    assert found.flag == js.Flag.NEIGHBOUR_OVERFLOW
+    assert (int(found.count) == 0) == serves
+    assert serves or 16 < int(found.count) <= 128

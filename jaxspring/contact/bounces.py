@@ -21,8 +21,9 @@ from jax import lax
 from jaxtyping import Array
 
 from ..forces.contact import Book
-from ..forces.planes import braked, pick
-from ..numerics import any_lane, tiny
+from ..forces.impacts import kicked
+from ..forces.planes import bounces, braked, is_slow, pick
+from ..numerics import any_lane
 from ..vector import Vector
 from .passage import Passage
 from .paths import Path
@@ -67,11 +68,8 @@ def thrown(scene: Passage, path: Path, pulled: Vector, chosen: tuple[Array, ...]
     touch = picked(chosen, touches)
     hit = _hit(scene, path, pulled, touch, chosen, is_hit)
     kick = (hit.kick - hit.rub).map(lambda b, s: jnp.where(hit.rests, s, b), hit.stop)
-    first, moments, books = path.first, path.moments, path.books
-    if first is not None and moments is not None:
-        now = (path.velocity + scene.offset, kick, path.left)
-        first = jax.tree.map(lambda old, new: jnp.where(path.is_struck, old, new), first, now)
-        moments = (moments[0] + path.left * kick, moments[1] + (0.5 * path.left * path.left) * kick)
+    first, moments = kicked(path, path.velocity + scene.offset, kick)
+    books = path.books
     if books is not None:
         at = path.velocity.map(lambda w, o: jnp.where(hit.rests, w + o, w), scene.offset)
         work, bounces = kick.dot(at + 0.5 * kick), (~hit.rests).astype(path.left.dtype)
@@ -103,7 +101,7 @@ def _hit(scene: Passage, path: Path, pulled: Vector, touch: Touch, chosen: tuple
     bend = pick(chosen, tuple(s.bend(path.position, along, pulled, clock) for s in scene.surfaces))
     # What falls from rest for half a step counts as rest, for e = 1 too: the hair is for rounding.
     slow = out <= (1 + float(jnp.finfo(out.dtype).eps) ** 0.5) * jnp.abs(scene.offset.dot(touch.normal))
-    still = scene.is_still(into, bend, pick(chosen, scene.rounding))
+    still = is_slow(into, bend, scene.dt, pick(chosen, scene.rounding))
     rests = is_hit & (bend < 0) & ((2 * out <= -bend * path.left * (1 - e)) | slow | still)
     kick, stop = (out - into) * lever, -touch.speed(true) * lever
     return Hit(touch.normal, lever, e, mu * length, out, drag, kick, rub, stop, bend, rests, touch.rate)
@@ -122,16 +120,8 @@ def _held(scene: Passage, path: Path, hit: Hit, touches: tuple[Touch, ...], chos
 
 def _hops(scene: Passage, path: Path, hit: Hit, chosen: tuple[Array, ...], more: Array) -> Path:
     """After all further bounces on the same obstacle that fit into the time left, where no other is in their way."""
-    e, left, one, zero = hit.restitution, path.left, jnp.ones_like(path.left), jnp.zeros_like(path.left)
-    decays = e < 1
-    ratio = jnp.where(decays, e, jnp.full_like(e, 0.5))
-    flight = jnp.where(more, 2 * hit.out / jnp.where(more, -hit.bend, one), one)
-    log = jnp.log(jnp.maximum(e, tiny(left.dtype)))
-    by_ratio = jnp.log1p(-jnp.where(more & decays, left * (1 - ratio) / flight, zero)) / jnp.where(log < 0, log, jnp.full_like(log, -1))
-    n = jnp.where(more, jnp.floor(lax.stop_gradient(jnp.where(decays, by_ratio, left / flight))), zero)
-    power = jnp.where(more, jnp.exp(n * log), one)
-    spread = jnp.where(decays, (1 - power) / (1 - ratio), n)  # 1 + e + e^2 + ..., n terms
-    total = jnp.where(more, flight * spread, zero)
+    e, left, zero = hit.restitution, path.left, jnp.zeros_like(path.left)
+    total, spread, power = bounces(e, hit.out, hit.bend, left, more)
     w, a = path.velocity - hit.out * hit.lever, scene.acceleration
     along = w + total * (a - a.dot(hit.normal) * hit.lever)
     slip = along + scene.offset - (along + scene.offset).dot(hit.normal) * hit.lever - hit.drag

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from ..forces.planes import meeting, pick
+from ..forces.planes import is_slow, meeting, pick
 from ..numerics import any_lane, stopped
 from ..vector import Vector
 from .bounces import thrown
@@ -111,7 +111,7 @@ def _next_impact(scene: Passage, path: Path, way: Way, bends: tuple[Array, ...])
     for i, (surface, touch, bend) in enumerate(zip(scene.surfaces, way.touches, bends, strict=True)):
         speed = touch.speed(way.velocity)
         is_on = touch.height <= scene.rounding[i]
-        lies = is_on & scene.is_still(speed, bend, scene.rounding[i])
+        lies = is_on & is_slow(speed, bend, scene.dt, scene.rounding[i])
         if isinstance(surface.obstacle, Flat):
             height = jnp.where(is_on, jnp.zeros_like(touch.height), touch.height)
             t, meets = meeting(height, speed, bend, path.left, lies)

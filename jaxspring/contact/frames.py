@@ -13,6 +13,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ..forces.planes import without
 from ..vector import Vector
 
 
@@ -31,9 +32,7 @@ class Frame(eqx.Module):
 
     def without(self, v: Vector) -> Vector:
         """`v` without its parts along the directions."""
-        for e in self.directions:
-            v = v - v.dot(e) * e
-        return v
+        return without(v, self.directions)
 
     def onto(self, v: Vector) -> Vector:
         """`v` moving with the surfaces along the directions."""

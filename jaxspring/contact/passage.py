@@ -74,11 +74,6 @@ class Passage(eqx.Module):
         squared = jnp.where(squared > 0, squared, jnp.ones_like(squared))
         return part / squared, 1 / jnp.sqrt(squared)
 
-    def is_still(self, speed: Array, bend: Array, rounding: Array) -> Array:
-        """Whether a speed along a normal is rounding of places, or nothing beside what the acceleration makes of it in the step."""
-        part = float(jnp.finfo(speed.dtype).eps) ** 0.5
-        return jnp.abs(speed) * self.dt <= rounding + part * jnp.abs(bend) * self.dt * self.dt
-
     def lifted(self, position: Vector) -> Vector:
         """The positions at the end of the step, none of them inside."""
         time = jnp.broadcast_to(self.start + self.dt, position.shape)

@@ -11,11 +11,11 @@ from jax import lax
 from jaxtyping import Array
 
 from ..forces.base import Step
-from ..forces.contact import Book, Books, damped, goes_first, pick_vector, where
-from ..forces.planes import pick
+from ..forces.contact import Book, Books, changed, damped, goes_first, parabola, pick_vector, unfinished_in, where
+from ..forces.planes import counted_from, pick
 from ..numerics import any_lane
 from ..state import State
-from ..status import Flag, Status
+from ..status import Status
 from ..vector import Vector
 from .encounters import follow, is_any_near
 from .passage import Passage
@@ -54,14 +54,7 @@ def strike(
 
     # Most steps of most scenes bring no node near: they pay for a distance alone.
     position, velocity, told, unfinished = lax.cond(any_lane(is_any_near(scene, path)), met, passed, path)
-    # Another rule may have moved or kicked nodes since: then what the impacts change is added to that.
-    if is_kicked:
-        position = state.position + (position - moved.position)
-        velocity = state.velocity + (velocity - moved.velocity)
-    status = Status.when(Flag.INVALID, step.dt < 0)
-    node = jnp.argmax(jnp.ravel(unfinished)).astype(jnp.int32)
-    status = status.then(Status.when(Flag.IMPACTS, jnp.any(unfinished), node=node, count=jnp.sum(unfinished)))
-    after = state.moved(position, velocity)
+    after, status = changed(state, moved, position, velocity, is_kicked), unfinished_in(step, unfinished)
     return after, status, None if told is None else tuple(_entry(chosen, told) for chosen in order)
 
 
@@ -70,17 +63,11 @@ _followed = eqx.filter_jit(follow)  # traced once in a run, which holds a step a
 
 def _begun(surfaces: tuple[Surface, ...], step: Step, books: bool) -> tuple[Passage, Path]:
     """The step as a parabola, and every node at its beginning. With dt <= 0 no time is left, in which nothing is met."""
-    before, moved = step.before, step.moved
-    goes = step.dt > 0
-    dt = jnp.where(goes, step.dt, jnp.ones_like(step.dt))
-    per_dt = 1 / dt
-    a = per_dt * (moved.velocity - before.velocity)
-    u = per_dt * (moved.position - before.position) - (0.5 * dt) * a
-    free = step.free if step.free is not None else (None,) * moved.dim
+    before, (dt, u, a, offset, left) = step.before, parabola(step)
+    free = step.free if step.free is not None else (None,) * u.dim
     rounding = tuple(s.rounding(before.position) for s in surfaces)
-    base = tuple(_base(s, before, least) for s, least in zip(surfaces, rounding, strict=True))
-    scene = Passage(surfaces, free, base, rounding, before.time, dt, a, moved.velocity - (u + dt * a))
-    left = jnp.broadcast_to(jnp.where(goes, step.dt, jnp.zeros_like(step.dt)), moved.position.shape)
+    base = tuple(counted_from(s.distance(before.position, before.time), least) for s, least in zip(surfaces, rounding, strict=True))
+    scene = Passage(surfaces, free, base, rounding, before.time, dt, a, offset)
     nothing, none = jnp.zeros_like(left), Vector.zeros_like(u)
     asks = step.by_velocity is not None
     path = Path(
@@ -95,12 +82,6 @@ def _begun(surfaces: tuple[Surface, ...], step: Step, books: bool) -> tuple[Pass
         books=tuple(Book(nothing, none, none) for _ in surfaces) if books else None,
     )
     return scene, path
-
-
-def _base(surface: Surface, before: State, rounding: Array) -> Array:
-    """Where a node counts from [m]: the surface, or its own place inside. What is inside by rounding only is on the surface."""
-    distance = surface.distance(before.position, before.time)
-    return jnp.where(distance < -rounding, distance, jnp.zeros_like(distance))
 
 
 def _ordered(surfaces: tuple[Surface, ...]) -> tuple[tuple[Surface, ...], tuple[tuple[Array, ...], ...]]:

@@ -26,7 +26,7 @@ from ..status import Flag, Status
 from ..vector import Vector
 from .base import Rule, Step, any_refused
 from .impacts import Impacts, Path
-from .planes import Plane, pick, without
+from .planes import Plane, counted_from, pick, without
 
 
 def coefficients(friction: Numbers, restitution: Numbers) -> tuple[Array, Array]:
@@ -156,15 +156,8 @@ def strike(
     # Most steps of most scenes hold no impact: they pay for looking alone.
     any_meets = any_lane(jnp.any(scene.next_impact(path)[2]))
     position, velocity, (work, given), unfinished = lax.cond(any_meets, met, passed, path)
-    # Another rule may have moved or kicked nodes since: then what the impacts change is added to that.
-    if is_kicked:
-        position = state.position + (position - moved.position)
-        velocity = state.velocity + (velocity - moved.velocity)
-    status = Status.when(Flag.INVALID, step.dt < 0)
-    if len(planes) > 1:
-        node = jnp.argmax(jnp.ravel(unfinished)).astype(jnp.int32)
-        status = status.then(Status.when(Flag.IMPACTS, jnp.any(unfinished), node=node, count=jnp.sum(unfinished)))
-    after = state.moved(position, velocity)
+    after = changed(state, moved, position, velocity, is_kicked)
+    status = unfinished_in(step, unfinished if len(planes) > 1 else None)
     if work is None or given is None:
         return after, status, None
     rubbed = [v - scene.lever(p.normal, left)[0] * v.dot(p.normal) for p, v, left in zip(planes, given, work, strict=True)]
@@ -174,17 +167,11 @@ def strike(
 
 def _begun(planes: tuple[Plane, ...], step: Step, books: bool) -> tuple[Impacts, Path]:
     """The step as a parabola, and every node at its beginning. With dt <= 0 no time is left, in which nothing is met."""
-    before, moved = step.before, step.moved
-    goes = step.dt > 0
-    dt = jnp.where(goes, step.dt, jnp.ones_like(step.dt))
-    per_dt = 1 / dt  # one division for all nodes
-    a = per_dt * (moved.velocity - before.velocity)
-    u = per_dt * (moved.position - before.position) - (0.5 * dt) * a
-    free = step.free if step.free is not None else (None,) * moved.dim
+    before, (dt, u, a, offset, left) = step.before, parabola(step)
+    free = step.free if step.free is not None else (None,) * u.dim
     rounding = tuple(p.rounding(before.position) for p in planes)
-    base = tuple(_base(p, before.position, least) for p, least in zip(planes, rounding, strict=True))
-    scene = Impacts(planes, free, base, rounding, dt, a, moved.velocity - (u + dt * a))
-    left = jnp.broadcast_to(jnp.where(goes, step.dt, jnp.zeros_like(step.dt)), moved.position.shape)
+    base = tuple(counted_from(p.height(before.position), least) for p, least in zip(planes, rounding, strict=True))
+    scene = Impacts(planes, free, base, rounding, dt, a, offset)
     nothing, none = jnp.zeros_like(left), Vector.zeros_like(u)
     asks = step.by_velocity is not None
     path = Path(
@@ -201,10 +188,36 @@ def _begun(planes: tuple[Plane, ...], step: Step, books: bool) -> tuple[Impacts,
     return scene, path
 
 
-def _base(plane: Plane, position: Vector, rounding: Array) -> Array:
-    """Where a node counts from [m]: the plane, or its own place below it. What is below by rounding only is on the plane."""
-    height = plane.height(position)
-    return jnp.where(height < -rounding, height, jnp.zeros_like(height))
+def parabola(step: Step) -> tuple[Array, Vector, Vector, Vector, Array]:
+    """dt, u, a, `off` (see `impacts.py`), and the time that each node has [s]: none with dt <= 0, where dt comes back as 1."""
+    before, moved = step.before, step.moved
+    goes = step.dt > 0
+    dt = jnp.where(goes, step.dt, jnp.ones_like(step.dt))
+    per_dt = 1 / dt  # one division for all nodes
+    a = per_dt * (moved.velocity - before.velocity)
+    u = per_dt * (moved.position - before.position) - (0.5 * dt) * a
+    left = jnp.broadcast_to(jnp.where(goes, step.dt, jnp.zeros_like(step.dt)), moved.position.shape)
+    return dt, u, a, moved.velocity - (u + dt * a), left
+
+
+def changed(state: State, moved: State, position: Vector, velocity: Vector, is_kicked: bool) -> State:
+    """The state after impacts that brought nodes from where they moved to these places and velocities.
+
+    Another rule may have moved or kicked nodes since: then what the impacts change is added to that.
+    """
+    if is_kicked:
+        position = state.position + (position - moved.position)
+        velocity = state.velocity + (velocity - moved.velocity)
+    return state.moved(position, velocity)
+
+
+def unfinished_in(step: Step, unfinished: Array | None) -> Status:
+    """INVALID for a step backward; IMPACTS where nodes would have gone on, if there is a limit."""
+    status = Status.when(Flag.INVALID, step.dt < 0)
+    if unfinished is None:
+        return status
+    node = jnp.argmax(jnp.ravel(unfinished)).astype(jnp.int32)
+    return status.then(Status.when(Flag.IMPACTS, jnp.any(unfinished), node=node, count=jnp.sum(unfinished)))
 
 
 def _ordered(planes: tuple[Plane, ...]) -> tuple[tuple[Plane, ...], tuple[tuple[Array, ...], ...]]:
@@ -266,4 +279,18 @@ def pick_vector(chosen: tuple[Array, ...], values: tuple[Vector, ...]) -> Vector
     return Vector(tuple(pick(chosen, parts) for parts in zip(*values, strict=True)))
 
 
-__all__ = ["Book", "Books", "Floor", "coefficients", "damped", "goes_first", "pick_vector", "refused", "strike", "where"]
+__all__ = [
+    "Book",
+    "Books",
+    "Floor",
+    "changed",
+    "coefficients",
+    "damped",
+    "goes_first",
+    "parabola",
+    "pick_vector",
+    "refused",
+    "strike",
+    "unfinished_in",
+    "where",
+]

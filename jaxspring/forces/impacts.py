@@ -29,6 +29,7 @@ Source: events in a step as in Hairer, Norsett and Wanner (1993), II.6; the numb
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -36,9 +37,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from ..numerics import any_lane, tiny
+from ..numerics import any_lane
 from ..vector import Vector
-from .planes import Plane, braked, meeting, pick, without
+from .planes import Plane, bounces, braked, is_slow, meeting, pick, without
 
 MOST = 16  # impacts (with a pair of planes) followed in one step
 
@@ -67,6 +68,15 @@ class Path(eqx.Module):
     moments: tuple[Vector, Vector] | None
     work: tuple[Array, ...] | None
     given: tuple[Vector, ...] | None
+
+
+def kicked(path: Any, velocity: Vector, kick: Vector) -> tuple[tuple[Vector, Vector, Array] | None, tuple[Vector, Vector] | None]:
+    """`first` and `moments` of a path after one more change of velocity, from this velocity on."""
+    if path.first is None or path.moments is None:
+        return path.first, path.moments
+    now = (velocity, kick, path.left)
+    first = jax.tree.map(lambda old, new: jnp.where(path.is_struck, old, new), path.first, now)
+    return first, (path.moments[0] + path.left * kick, path.moments[1] + (0.5 * path.left * path.left) * kick)
 
 
 class _Hit(eqx.Module):
@@ -161,8 +171,7 @@ class Impacts(eqx.Module):
 
     def is_still(self, into: Array, pressed: Array, plane: int) -> Array:
         """Whether a speed along a normal is rounding of places, or nothing beside what the acceleration makes of it in the step."""
-        part = float(jnp.finfo(into.dtype).eps) ** 0.5
-        return jnp.abs(into) * self.dt <= self.rounding[plane] + part * jnp.abs(pressed) * self.dt * self.dt
+        return is_slow(into, pressed, self.dt, self.rounding[plane])
 
     def free_part(self, v: Vector, like: Array) -> Vector:
         """`v` where free, zero where held; in node shape where a coordinate is held anywhere."""
@@ -264,11 +273,8 @@ class Impacts(eqx.Module):
         """The path after the impact that it has come to."""
         hit = self._hit(path, chosen, is_hit)
         kick = hit.bounce.map(lambda b, s: jnp.where(hit.rests, s, b), hit.stop)
-        first, moments, work, given = path.first, path.moments, path.work, path.given
-        if first is not None and moments is not None:
-            now = (path.velocity + self.offset, kick, path.left)
-            first = jax.tree.map(lambda old, new: jnp.where(path.is_struck, old, new), first, now)
-            moments = (moments[0] + path.left * kick, moments[1] + (0.5 * path.left * path.left) * kick)
+        work, given = path.work, path.given
+        first, moments = kicked(path, path.velocity + self.offset, kick)
         if work is not None and given is not None:
             at = path.velocity.map(lambda w, o: jnp.where(hit.rests, w + o, w), self.offset)
             work = tuple(b + jnp.where(c, kick.dot(at + 0.5 * kick), jnp.zeros_like(b)) for b, c in zip(work, chosen, strict=True))
@@ -303,17 +309,8 @@ class Impacts(eqx.Module):
 
     def _hops(self, path: Path, hit: _Hit, chosen: tuple[Array, ...], more: Array) -> Path:
         """The bounces of `_hopped`, of the nodes that have more of them."""
-        e, left, one, zero = hit.restitution, path.left, jnp.ones_like(path.left), jnp.zeros_like(path.left)
-        decays = e < 1
-        ratio = jnp.where(decays, e, jnp.full_like(e, 0.5))
-        flight = jnp.where(more, 2 * hit.out / jnp.where(more, -hit.pressed, one), one)
-        log = jnp.log(jnp.maximum(e, tiny(left.dtype)))
-        # The last bounce but rounding: which side of it is left to rounding makes no difference to where the node is.
-        by_ratio = jnp.log1p(-jnp.where(more & decays, left * (1 - ratio) / flight, zero)) / jnp.where(log < 0, log, jnp.full_like(log, -1))
-        n = jnp.where(more, jnp.floor(lax.stop_gradient(jnp.where(decays, by_ratio, left / flight))), zero)
-        power = jnp.where(more, jnp.exp(n * log), one)
-        spread = jnp.where(decays, (1 - power) / (1 - ratio), n)  # 1 + e + e^2 + ..., n terms
-        total = jnp.where(more, flight * spread, zero)
+        e, left, zero = hit.restitution, path.left, jnp.zeros_like(path.left)
+        total, spread, power = bounces(e, hit.out, hit.pressed, left, more)
         w = path.velocity - hit.out * hit.lever
         along = w + total * (self.acceleration - hit.pressed * hit.lever)
         slip = along + self.offset - self.offset.dot(hit.normal) * hit.lever
@@ -337,4 +334,4 @@ class Impacts(eqx.Module):
         return jax.tree.map(lambda new, old: jnp.where(clear, new, old), after, path)
 
 
-__all__ = ["MOST", "Impacts", "Path"]
+__all__ = ["MOST", "Impacts", "Path", "kicked"]

@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array
 
+from ..numerics import tiny
 from ..vector import Vector
 
 ROUNDING = 16  # of the terms of a height, in units of the last place
@@ -57,6 +59,43 @@ def meeting(s: Array, u: Array, a: Array, left: Array, at_once: Array) -> tuple[
     return jnp.where(is_apart, top / jnp.where(is_apart, bottom, one), zero), meets
 
 
+def counted_from(height: Array, rounding: Array) -> Array:
+    """Where a node counts from [m]: the surface, or its own place inside. What is inside by rounding only is on the surface."""
+    return jnp.where(height < -rounding, height, jnp.zeros_like(height))
+
+
+def is_slow(speed: Array, bend: Array, dt: Array, rounding: Array) -> Array:
+    """Whether a speed along a normal is rounding of places, or nothing beside what the acceleration `bend` makes of it in the step."""
+    part = float(jnp.finfo(speed.dtype).eps) ** 0.5
+    return jnp.abs(speed) * dt <= rounding + part * jnp.abs(bend) * dt * dt
+
+
+def bounces(e: Array, out: Array, bend: Array, left: Array, more: Array) -> tuple[Array, Array, Array]:
+    """All further bounces that fit into the time left, where there are `more`.
+
+    Args:
+        e: restitution.
+        out: speed after the first of them [m/s].
+        bend: acceleration along the normal, below zero where there are more [m/s^2].
+        left: time [s].
+        more: where they are asked for.
+
+    Returns:
+        How long they last [s]; 1 + e + e^2 + ..., a term for each; e to their number.
+    """
+    one, zero = jnp.ones_like(left), jnp.zeros_like(left)
+    decays = e < 1
+    ratio = jnp.where(decays, e, jnp.full_like(e, 0.5))
+    flight = jnp.where(more, 2 * out / jnp.where(more, -bend, one), one)
+    log = jnp.log(jnp.maximum(e, tiny(left.dtype)))
+    # The last bounce but rounding: which side of it is left to rounding makes no difference to where the node is.
+    by_ratio = jnp.log1p(-jnp.where(more & decays, left * (1 - ratio) / flight, zero)) / jnp.where(log < 0, log, jnp.full_like(log, -1))
+    n = jnp.where(more, jnp.floor(lax.stop_gradient(jnp.where(decays, by_ratio, left / flight))), zero)
+    power = jnp.where(more, jnp.exp(n * log), one)
+    spread = jnp.where(decays, (1 - power) / (1 - ratio), n)
+    return jnp.where(more, flight * spread, zero), spread, power
+
+
 def without(v: Vector, basis: tuple[Vector, ...]) -> Vector:
     """`v` without its parts along these directions of length one (or zero)."""
     for e in basis:
@@ -79,4 +118,4 @@ def pick(chosen: tuple[Array, ...], values: tuple[Array, ...]) -> Array:
     return found
 
 
-__all__ = ["Plane", "braked", "meeting", "pick", "without"]
+__all__ = ["Plane", "bounces", "braked", "counted_from", "is_slow", "meeting", "pick", "without"]

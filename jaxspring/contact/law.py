@@ -23,6 +23,7 @@ from jaxtyping import Array
 from .._arrays import Numbers
 from .._checks import constant, node_values, nonnegative
 from ..forces.base import any_not_positive, any_refused
+from ..vector import Vector
 
 # Why a constant is refused.
 NO_PUSH = "A negative stiffness pulls inward."
@@ -92,6 +93,11 @@ class ContactLaw(eqx.Module):
         is_beyond, zero = depth >= self.onset, jnp.zeros_like(depth)
         rising = jnp.where(is_beyond, self.onset, jnp.where(depth > 0, depth, zero))
         return rising, jnp.where(is_beyond, depth - self.onset, zero)
+
+    def rounding(self, position: Vector) -> Array:
+        """The largest coordinate's rounding over the onset."""
+        eps = jnp.asarray(jnp.finfo(position.dtype).eps, position.dtype)
+        return position.largest() * eps / self.onset.astype(position.dtype)
 
     def invalid(self) -> Array:
         """Whether a constant is negative or not finite, or onset or creep not positive."""

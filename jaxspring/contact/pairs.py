@@ -190,8 +190,7 @@ class NodeContact(Force):
 
     def rounding(self, state: State) -> Array:
         """The largest coordinate's rounding over the onset."""
-        eps = jnp.asarray(jnp.finfo(state.dtype).eps, state.dtype)
-        return state.position.largest() * eps / self.law.onset.astype(state.dtype)
+        return self.law.rounding(state.position)
 
     def remember(self, state: State) -> Any:
         """The list that its pairs reuse, or None."""

@@ -179,8 +179,7 @@ class Penalty(Force):
 
     def rounding(self, state: State) -> Array:
         """The largest coordinate's rounding over the onset."""
-        eps = jnp.asarray(jnp.finfo(state.dtype).eps, state.dtype)
-        return state.position.largest() * eps / self.law.onset.astype(state.dtype)
+        return self.law.rounding(state.position)
 
     def invalid(self) -> Array:
         """Whether law or obstacle has a constant that its constructor would refuse."""

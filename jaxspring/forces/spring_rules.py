@@ -15,7 +15,7 @@ from .._checks import is_concrete
 from ..numerics import cast_inexact
 from ..state import State
 from ..topology.base import Topology
-from ..topology.edge_field import EdgeField
+from ..topology.edge_field import EdgeField, named_entries
 from .base import Rule, Scene
 from .living import living
 from .molten import check_springs
@@ -89,17 +89,10 @@ class Breaking(SpringRule):
         return self.net.map_springs(lambda alive, holds: alive & holds, living(self.net, state), unbroken)
 
 
-def entries(name: str, value: Any) -> list[tuple[str, Any]]:
-    """The arrays of a constant of springs, each with its name; none of None."""
-    if isinstance(value, EdgeField):
-        return [(f"{name}.families[{i}]", entry) for i, entry in enumerate(value.families)]
-    return [] if value is None else [(name, value)]
-
-
 def check_lengths(name: str, springs: Springs) -> None:
     """ValueError where a strain is asked of a spring without rest length."""
-    if any(is_concrete(entry) and np.any(np.asarray(entry) == 0) for _, entry in entries("rest_length", springs.rest_length)):
+    if any(is_concrete(entry) and np.any(np.asarray(entry) == 0) for _, entry in named_entries("rest_length", springs.rest_length)):
         raise ValueError(f"{name} is a stretch over the rest length, but a rest length of these springs is zero. Give a force instead.")
 
 
-__all__ = ["Breaking", "SpringRule", "check_lengths", "entries"]
+__all__ = ["Breaking", "SpringRule", "check_lengths"]

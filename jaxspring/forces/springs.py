@@ -25,7 +25,7 @@ from ..numerics import cast_inexact, tiny
 from ..state import State
 from ..status import Status
 from ..topology.base import Topology
-from ..topology.edge_field import EdgeField, SpringNumbers, ZeroOutside
+from ..topology.edge_field import EdgeField, SpringNumbers, ZeroOutside, named_entries
 from ..topology.periods import box_of
 from ..vector import Vector
 from .actuation import Actuation
@@ -391,9 +391,7 @@ def _edge_constant(net: Topology, name: str, value: Any) -> Any:
 
 
 def _check_sign(name: str, value: Any, why: str, any_sign: bool = False) -> None:
-    entries = value.families if isinstance(value, EdgeField) else (value,)
-    for i, entry in enumerate(entries):
-        place = f"{name}.families[{i}]" if isinstance(value, EdgeField) else name
+    for place, entry in named_entries(name, value):
         if any_sign:
             finite(place, entry)
         else:

@@ -25,11 +25,11 @@ from ..memory import with_entry
 from ..state import State
 from ..status import Status
 from ..topology.base import Topology
-from ..topology.edge_field import EdgeField, SpringNumbers
+from ..topology.edge_field import EdgeField, SpringNumbers, named_entries
 from .base import Scene, Step, any_not_positive
 from .history import Onset, Torn, begun, never
 from .living import map_living
-from .spring_rules import Breaking, check_lengths, entries
+from .spring_rules import Breaking, check_lengths
 
 
 class Tearing(Breaking):
@@ -132,7 +132,7 @@ class Tearing(Breaking):
 def _constant(net: Topology, name: str, value: SpringNumbers | None) -> Any:
     """A constant as the user passed it, or None."""
     found = None if value is None else net.edge_constant(value, name)
-    for place, entry in entries(name, found):
+    for place, entry in named_entries(name, found):
         positive(place, entry, "A spring would be torn at rest, or no band be left: leave band out for springs that tear at once.")
     return found
 

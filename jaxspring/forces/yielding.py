@@ -29,12 +29,12 @@ from ..numerics import stopped
 from ..state import State
 from ..status import Flag, Status
 from ..topology.base import Topology
-from ..topology.edge_field import EdgeField, SpringNumbers
+from ..topology.edge_field import EdgeField, SpringNumbers, named_entries
 from .base import Scene, Step, any_not_positive, any_refused
 from .history import Onset, Yielded, begun, never
 from .laws import Hooke, TensionOnly
 from .living import map_living
-from .spring_rules import SpringRule, check_lengths, entries
+from .spring_rules import SpringRule, check_lengths
 from .springs import _check_sign
 
 
@@ -89,7 +89,7 @@ class Yielding(SpringRule):
         self.yield_strain = _constant(net, "yield_strain", yield_strain)
         self.hardening = _constant(net, "hardening", hardening)
         self.viscosity = _constant(net, "viscosity", viscosity)
-        for name, entry in entries("viscosity", self.viscosity):
+        for name, entry in named_entries("viscosity", self.viscosity):
             positive(name, entry, "A spring would slip without end. Leave the viscosity out for one that yields at once.")
         self.springs = None
 

@@ -13,7 +13,9 @@ import os
 import pathlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
+Settings = TypeVar("Settings")
 REPORT = "report.json"
 
 
@@ -102,6 +104,19 @@ def _listed(report: pathlib.Path) -> set[str]:
     return {name for name in files if isinstance(name, str)} if isinstance(files, list) else set()
 
 
+def settings_of(kind: Callable[..., Settings], given: argparse.Namespace, names: tuple[str, ...]) -> Settings:
+    """A scene's settings, with those of these arguments that were given.
+
+    Raises:
+        UnusableError: they make no scene.
+    """
+    changed = {name: getattr(given, name) for name in names if getattr(given, name) is not None}
+    try:
+        return kind(**changed)
+    except ValueError as error:
+        raise UnusableError(str(error)) from error
+
+
 def number(text: str) -> float:
     """An argument that is a finite number."""
     try:
@@ -131,5 +146,6 @@ __all__ = [
     "check_replaceable",
     "file_names",
     "number",
+    "settings_of",
     "whole_number",
 ]

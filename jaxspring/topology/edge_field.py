@@ -93,6 +93,13 @@ class EdgeField(eqx.Module):
         return self.map(lambda entry: operation(entry, other))
 
 
+def named_entries(name: str, value: Any) -> list[tuple[str, Any]]:
+    """The arrays of a constant of springs, each with its name for messages; none of None."""
+    if isinstance(value, EdgeField):
+        return [(f"{name}.families[{i}]", entry) for i, entry in enumerate(value.families)]
+    return [] if value is None else [(name, value)]
+
+
 def _common_identity(*fields: EdgeField) -> NetIdentity | None:
     known = [field.identity for field in fields if field.identity is not None]
     for other in known[1:]:

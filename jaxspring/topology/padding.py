@@ -70,8 +70,7 @@ class NetBatch(eqx.Module):
             ValueError: another number of arrays than nets, or of rows than nodes.
         """
         arrays = self._each("points", points, self.n_nodes)
-        filled = [jnp.concatenate([a, jnp.repeat(a[i : i + 1], p.order.size - n, axis=0)]) for a, i, p, n in self._with(arrays)]
-        return jnp.stack([_placed(p, a) for p, a in zip(self.nodes, filled, strict=True)])
+        return _stacked(self.nodes, arrays, [a[i] for a, i in zip(arrays, self.anchors, strict=True)])
 
     def at_nodes(self, values: Sequence[Numbers], fill: float = 0.0) -> Array:
         """For each net (N_b, ...) values of its nodes -> (B, N, ...), `fill` at empty places: velocities 0, masses 1.
@@ -79,7 +78,7 @@ class NetBatch(eqx.Module):
         Raises:
             ValueError: another number of arrays than nets, or of rows than nodes.
         """
-        return _stacked(self.nodes, self._each("values", values, self.n_nodes), fill)
+        return _stacked(self.nodes, self._each("values", values, self.n_nodes), [fill] * len(self.nodes))
 
     def at_springs(self, values: Sequence[Numbers], fill: float = 0.0) -> Array:
         """For each net (E_b,) values of its springs -> (B, E), `fill` for springs that it does not have: stiffness 0, rest length 1.
@@ -87,7 +86,7 @@ class NetBatch(eqx.Module):
         Raises:
             ValueError: another number of arrays than nets, or of rows than springs.
         """
-        return _stacked(self.springs, self._each("values", values, self.n_springs), fill)
+        return _stacked(self.springs, self._each("values", values, self.n_springs), [fill] * len(self.springs))
 
     def of_nodes(self, values: Numbers) -> list[Array]:
         """(B, N, ...) -> for each net (N_b, ...), in its own order."""
@@ -96,9 +95,6 @@ class NetBatch(eqx.Module):
     def of_springs(self, values: Numbers) -> list[Array]:
         """(B, E, ...) -> for each net (E_b, ...), in its own order."""
         return _apart(self.springs, self.n_springs, values)
-
-    def _with(self, arrays: list[Array]) -> Any:
-        return zip(arrays, self.anchors, self.nodes, self.n_nodes, strict=True)
 
     def _each(self, name: str, values: Sequence[Numbers], counts: tuple[int, ...]) -> list[Array]:
         arrays = [own(f"{name}[{b}]", a) for b, a in enumerate(values)]
@@ -141,6 +137,9 @@ def pad_nets(nets: Sequence[Graph]) -> NetBatch:
     _check(nets)
     pairs = [net.edges for net in nets]
     degrees = [np.bincount(p.ravel(), minlength=net.n_nodes) for net, p in zip(nets, pairs, strict=True)]
+    for b, degree in enumerate(degrees):
+        if degree.max() > WIDEST:
+            raise ValueError(f"nets[{b}] has a node with {degree.max()} springs; in a batch of nets a node has {WIDEST} at most.")
     falling = common(degrees)
     at = np.argsort(by_class(falling))
     n_springs = max(len(p) for p in pairs)
@@ -171,9 +170,6 @@ def _check(nets: list[Any]) -> None:
             raise TypeError(f"nets[{b}] is a {type(net).__name__}; expected a Graph. Lattices of one shape need no padding.")
         if net.n_springs == 0:
             raise ValueError(f"nets[{b}] has no spring.")
-        most = int(np.bincount(net.edges.ravel()).max())
-        if most > WIDEST:
-            raise ValueError(f"nets[{b}] has a node with {most} springs; in a batch of nets a node has {WIDEST} at most.")
         if (net.box is None) != (nets[0].box is None) or (net.box is not None and net.box.shape != nets[0].box.shape):
             raise ValueError(f"nets[{b}] and nets[0] have not the same periodic coordinates; all nets of a batch have, or none.")
 
@@ -189,7 +185,7 @@ def _placed_net(
     connected = ranked[degree[ranked] > 0]
     place = np.full(n, -1)
     # Inside a class in the net's own order, for locality.
-    mine = at[np.arange(len(connected))]
+    mine = at[: len(connected)]
     for w in np.unique(falling[: len(connected)]):
         of_class = np.flatnonzero(falling[: len(connected)] == w)
         nodes = connected[of_class]
@@ -202,7 +198,7 @@ def _placed_net(
     kept = net.springs.order
     ends = _filled_up(tables(place[pairs[kept]], falling[by_class(falling)]), n_springs)
     springs = Permutation(np.concatenate([kept, np.arange(len(pairs), n_springs)]))
-    anchor = int(order[np.flatnonzero(np.isin(np.arange(size), place[degree > 0])).min()])
+    anchor = int(order[place[degree > 0].min()])
     return ends, Permutation(order), springs, anchor
 
 
@@ -220,16 +216,14 @@ def _filled_up(ends: Ends, n_springs: int) -> Ends:
     return dataclasses.replace(ends, entries=entries, tails=tails, heads=heads, at_tails=at_tails, at_heads=at_heads, exists=exists)
 
 
-def _placed(permutation: Permutation, rows: Array) -> Array:
-    """(N, ...) in the user's order -> by places."""
-    return jnp.moveaxis(permutation.inward(jnp.moveaxis(rows, 0, -1)), -1, 0)
+def _stacked(permutations: tuple[Permutation, ...], arrays: list[Array], fills: Sequence[Any]) -> Array:
+    """Each array (n, ...) in the user's order, filled up, by places."""
 
+    def placed(permutation: Permutation, a: Array, fill: Any) -> Array:
+        more = jnp.broadcast_to(jnp.asarray(fill, a.dtype), (permutation.order.size - a.shape[0], *a.shape[1:]))
+        return jnp.moveaxis(permutation.inward(jnp.moveaxis(jnp.concatenate([a, more]), 0, -1)), -1, 0)
 
-def _stacked(permutations: tuple[Permutation, ...], arrays: list[Array], fill: float) -> Array:
-    def longer(a: Array, size: int) -> Array:
-        return jnp.concatenate([a, jnp.full((size - a.shape[0], *a.shape[1:]), fill, a.dtype)])
-
-    return jnp.stack([_placed(p, longer(a, p.order.size)) for p, a in zip(permutations, arrays, strict=True)])
+    return jnp.stack([placed(*each) for each in zip(permutations, arrays, fills, strict=True)])
 
 
 def _apart(permutations: tuple[Permutation, ...], counts: tuple[int, ...], values: Numbers) -> list[Array]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import pathlib
 
-from ..command import Command, UnusableError, Written
+from ..command import Command, Written, settings_of
 
 LARGEST_BLOCK = 4_096  # particles: every pair of them is looked at in every step
 
@@ -33,12 +33,7 @@ def run(given: argparse.Namespace, out: pathlib.Path) -> Written:
     from .job import melt
     from .scene import MeltSettings
 
-    changed = {"nodes": given.nodes, "duration": given.duration}
-    try:
-        settings = MeltSettings(**{name: value for name, value in changed.items() if value is not None})
-    except ValueError as error:
-        raise UnusableError(str(error)) from error
-    return melt(settings, out, Progress("melt"), given.resume)
+    return melt(settings_of(MeltSettings, given, ("nodes", "duration")), out, Progress("melt"), given.resume)
 
 
 def block(text: str) -> tuple[int, int, int]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import pathlib
 
-from ..command import Command, UnusableError, Written, number, whole_number
+from ..command import Command, UnusableError, Written, number, settings_of, whole_number
 
 LARGEST_DEPTH = 8
 LONGEST = 20.0  # seconds of a walk: gradients through more are lost in chaos
@@ -38,11 +38,7 @@ def run(given: argparse.Namespace, out: pathlib.Path) -> Written:
     from .job import walk_job
     from .scene import RobotSettings
 
-    changed = {name: getattr(given, name) for name in ("depth", "body", "duration", "seed")}
-    try:
-        settings = RobotSettings(**{name: value for name, value in changed.items() if value is not None})
-    except ValueError as error:
-        raise UnusableError(str(error)) from error
+    settings = settings_of(RobotSettings, given, ("depth", "body", "duration", "seed"))
     if settings.duration > LONGEST:
         raise UnusableError(f"--duration {settings.duration:g}: a walk takes {LONGEST:g} seconds at most.")
     return walk_job(settings, given.iterations, out, given.resume)

@@ -70,6 +70,10 @@ PUBLIC: dict[str, dict[str, tuple[str, ...]]] = {
         "inverse.checkpoint": ("Checkpoint",),
         "inverse.check": ("check_gradient",),
     },
+    "cloth": {
+        "forces.cloth_laws": ("ChoiKo", "Stiffening"),
+        "forces.strain_limit": ("StrainLimit",),
+    },
     "contact": {
         "contact.base": ("Obstacle",),
         "contact.rule": ("Contact",),

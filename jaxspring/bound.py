@@ -165,7 +165,8 @@ class BoundSystem(Nodes):
     def _step(self, before: State, moved: State, dt: Array, meets: bool) -> Step:
         """What the rules may know of a step; what only obstacles ask for is None where there are none."""
         if not meets:
-            return Step(before, moved, dt)
+            sees_free = any(part.sees_free for _, part in self.followers)
+            return Step(before, moved, dt, self.free_masks(moved.dim) if sees_free else None)
         lagging = tuple(f for f in self.forces if reads_velocity(f, moved))
 
         def by_velocity(velocity: Vector) -> Vector:

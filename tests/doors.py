@@ -87,6 +87,7 @@ DOORS: dict[str, Door] = {
     "Contact": Door(
         lambda **a: js.contact.Contact(js.contact.Sphere((0.0, 0.0), 1.0), **a), {"friction": number(0.25), "restitution": number(0.5)}
     ),
+    "ChoiKo": Door(js.cloth.ChoiKo, {"bending": number(0.5)}),
     "Convection": Door(
         lambda **a: js.thermal.Convection(net(), **a),
         {"nodes": PATTERN, "coefficient": per_node(), "ambient": per_node(280), "area": per_node()},
@@ -199,6 +200,8 @@ DOORS: dict[str, Door] = {
             "temperature": per_node(300),
         },
     ),
+    "Stiffening": Door(js.cloth.Stiffening, {"strain": number(0.1), "factor": number(20.0), "band": number(0.05)}),
+    "StrainLimit": Door(lambda **a: js.cloth.StrainLimit(net(), **a), {"strain": per_spring(), "tolerance": number(0.01)}),
     "Switched": Door(js.fluid.Switched, {"on": number(2.0), "off": number(2.5)}),
     "System": Door(lambda **a: js.System(net(), **a), {"mass": per_node(), "free": PATTERN}),
     "ThermalExpansion": Door(js.thermal.ThermalExpansion, {"coefficient": number(0.5), "reference": number(300.0)}),

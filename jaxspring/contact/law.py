@@ -23,6 +23,7 @@ from jaxtyping import Array
 from .._arrays import Numbers
 from .._checks import constant, node_values, nonnegative
 from ..forces.base import any_not_positive, any_refused
+from ..forces.ramp import ramp, ramp_energy, ramp_slope
 from ..vector import Vector
 
 # Why a constant is refused.
@@ -60,18 +61,15 @@ class ContactLaw(eqx.Module):
 
     def push(self, depth: Array) -> Array:
         """Force over stiffness [m], of a depth [m]; zero outside."""
-        rising, beyond = self._parts(depth)
-        return rising * rising / (2 * self.onset) + beyond
+        return ramp(depth, self.onset)
 
     def slope(self, depth: Array) -> Array:
         """Derivative of `push`, between 0 and 1."""
-        rising, _ = self._parts(depth)
-        return rising / self.onset
+        return ramp_slope(depth, self.onset)
 
     def energy(self, depth: Array) -> Array:
         """Energy over stiffness [m^2]."""
-        rising, beyond = self._parts(depth)
-        return rising * rising * rising / (6 * self.onset) + 0.5 * beyond * (beyond + self.onset)
+        return ramp_energy(depth, self.onset)
 
     def grip(self, depth: Array) -> Array:
         """Which part of the damper acts, between 0 and 1."""
@@ -87,12 +85,6 @@ class ContactLaw(eqx.Module):
     def drag_slope(self, speed: Array) -> Array:
         """Derivative of friction over mu times push by the tangential speed [s/m]."""
         return jnp.where(speed < self.creep, 2 * (1 - speed / self.creep) / self.creep, jnp.zeros_like(speed))
-
-    def _parts(self, depth: Array) -> tuple[Array, Array]:
-        """The depth up to the onset, and what is beyond it [m]."""
-        is_beyond, zero = depth >= self.onset, jnp.zeros_like(depth)
-        rising = jnp.where(is_beyond, self.onset, jnp.where(depth > 0, depth, zero))
-        return rising, jnp.where(is_beyond, depth - self.onset, zero)
 
     def rounding(self, position: Vector) -> Array:
         """The largest coordinate's rounding over the onset."""

@@ -55,7 +55,7 @@ class Step(eqx.Module):
         before: the state in which it began.
         moved: where motion took it, before any rule.
         dt: [s].
-        free: per coordinate, where nodes are free (None: all are). None where no obstacle asks.
+        free: per coordinate, where nodes are free (None: all are). None where no obstacle asks, nor a rule that `sees_free`.
         by_velocity: (velocities) -> accelerations [m/s^2] by the forces that depend on velocity, where motion ended; None where no force
             does, or no obstacle asks.
         stages: what the rules before this one left, in their order: (place, state), all obstacles together as one of place -1.
@@ -117,6 +117,7 @@ class Rule(eqx.Module):
         drives: whether it acts after the obstacles, on the state in which the next step begins, and changes neither positions nor
             velocities: it gives commands that hold for a step (class attribute).
         watches: whether it acts last, and is told by `Step.stages` what all the others did (class attribute).
+        sees_free: whether it reads `Step.free` (class attribute; obstacles may in any case).
         place: which part of its system it is, once bound: its index in a status and in `state.memory` (static).
     """
 
@@ -127,6 +128,7 @@ class Rule(eqx.Module):
     sets_temperature: ClassVar[bool] = False
     drives: ClassVar[bool] = False
     watches: ClassVar[bool] = False
+    sees_free: ClassVar[bool] = False
     place: int | None = eqx.field(static=True, init=False, default=None)
 
     def __str__(self) -> str:

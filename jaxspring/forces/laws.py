@@ -72,11 +72,11 @@ class Hooke(Law):
     def weight(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
         """Weight k (1 - l / r) [N/m]."""
         # One rsqrt, guarded by a maximum: as fast as no guard. The derivative rule treats length zero.
-        return stiffness * (1 - rest_length * _inverse_length(squared_length))
+        return stiffness * (1 - rest_length * inverse_length(squared_length))
 
     def slope(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
         """Slope k l / r [N/m]."""
-        return stiffness * (rest_length * _inverse_length(squared_length))
+        return stiffness * (rest_length * inverse_length(squared_length))
 
     def energy(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
         """k/2 (r - l)^2 [J]."""
@@ -91,7 +91,7 @@ class TensionOnly(Law):
 
     def weight(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
         """Weight k max(0, 1 - l / r) [N/m]."""
-        return stiffness * jnp.maximum(1 - rest_length * _inverse_length(squared_length), jnp.zeros((), squared_length.dtype))
+        return stiffness * jnp.maximum(1 - rest_length * inverse_length(squared_length), jnp.zeros((), squared_length.dtype))
 
     def energy(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
         """k/2 max(0, r - l)^2 [J]."""
@@ -119,7 +119,7 @@ class PowerLaw(Law):
         strain = length_of(squared_length) / rest_length - 1
         # In this order no product leaves the range of float32 before the weight itself does.
         growth = stiffness * (jnp.sign(strain) * _power(jnp.abs(strain), self.exponent))
-        return growth * (rest_length * _inverse_length(squared_length))
+        return growth * (rest_length * inverse_length(squared_length))
 
     def slope(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
         """Derivative of the pull, n k |e / l|^(n-1), less the weight [N/m]."""
@@ -148,7 +148,7 @@ class EnergyLaw(Law):
 
     def weight(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
         """Derivative of the energy by the length, over the length [N/m]."""
-        return self._pull(length_of(squared_length), stiffness, rest_length) * _inverse_length(squared_length)
+        return self._pull(length_of(squared_length), stiffness, rest_length) * inverse_length(squared_length)
 
     def slope(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
         """Second derivative of the energy by the length, less the weight [N/m]."""
@@ -173,7 +173,7 @@ class PullLaw(Law):
 
     def weight(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
         """The user's pull over the length [N/m]."""
-        return self.function(length_of(squared_length), stiffness, rest_length) * _inverse_length(squared_length)
+        return self.function(length_of(squared_length), stiffness, rest_length) * inverse_length(squared_length)
 
     def slope(self, squared_length: Array, stiffness: Array, rest_length: Array) -> Array:
         """Derivative of the pull by the length, less the weight [N/m]."""
@@ -202,7 +202,7 @@ def _tangent(static: Any, residuals: Any, operand: Any) -> Vector:
     dd, *constants = operand
     squared, is_long = _guarded(d)
     weight, slope = _linearised(eqx.combine(params, static), squared, is_long, stiffness, rest_length)
-    inverse = _inverse_length(squared)
+    inverse = inverse_length(squared)
     of_constants = partial(_weight, static, squared)
     _, by_constants = jax.jvp(of_constants, (stiffness, rest_length, params), tuple(constants))
     along = slope * (d.dot(dd) * inverse) * inverse + by_constants
@@ -215,7 +215,7 @@ def _tangent_transpose(static: Any, residuals: Any, q: Vector) -> Any:
     squared, is_long = _guarded(d)
     weight, slope = _linearised(eqx.combine(params, static), squared, is_long, stiffness, rest_length)
     # As in the laws, so that XLA computes it once.
-    inverse = _inverse_length(squared)
+    inverse = inverse_length(squared)
     # A division, so that XLA keeps it as an array of its own instead of computing it anew in each of its five readers.
     length = lax.sqrt(squared)
     along = d.dot(q) / length
@@ -289,20 +289,21 @@ def _spring_energy_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
     return energy, total
 
 
-def _inverse_length(squared: Array) -> Array:
+def inverse_length(squared: Array) -> Array:
+    """One over the root of a squared length; large and finite where there is none."""
     return lax.rsqrt(jnp.maximum(squared, tiny(squared.dtype)))
 
 
 def length_of(squared: Array) -> Array:
     """The root of a squared length, with derivative zero where there is none; NaN where the square has overflowed."""
-    return squared * _inverse_length(squared)
+    return squared * inverse_length(squared)
 
 
 def _slope_of(pull: Callable[..., Array], squared: Array, stiffness: Array, rest_length: Array) -> Array:
     """By the length and not by its square, since cubes of lengths would come in, and leave the range of float32."""
     length = length_of(squared)
     value, rate = jax.jvp(lambda r: pull(r, stiffness, rest_length), (length,), (jnp.ones_like(length),))
-    return rate - value * _inverse_length(squared)
+    return rate - value * inverse_length(squared)
 
 
 def _power(base: Array, exponent: float) -> Array:

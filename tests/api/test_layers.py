@@ -34,6 +34,7 @@ LAYERS = {
     "fluid": 3,  # public names of forces
     "plasticity": 3,  # as well
     "masses": 4,
+    "cloth": 4,  # what a cloth is made of
     "nodes": 4,
     "bound": 4,
     "system": 4,

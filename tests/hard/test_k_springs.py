@@ -641,6 +641,7 @@ def instances():
             js.plasticity.Onset(whole, whole, number),
         ),
         *(js.plasticity.Yielded(field, field, field), js.plasticity.Torn(field, None, None)),
+        *(js.cloth.ChoiKo(0.5), js.cloth.Stiffening(), js.cloth.StrainLimit(TWO)),
         *(robot, robot.settings, robot.controller, js.robot.body_of_cells(("#",), 1.0)),
         *(js.robot.Oscillators([0.1], [0.0], 1.0), js.robot.Actuation(js.robot.Oscillators([0.1], [0.0], 1.0), [0])),
     ]

@@ -70,6 +70,16 @@ PUBLIC: dict[str, dict[str, tuple[str, ...]]] = {
         "inverse.checkpoint": ("Checkpoint",),
         "inverse.check": ("check_gradient",),
     },
+    "cloth": {
+        "cloth.meshes": ("disc", "outline", "provot", "rectangle"),
+        "cloth.materials": ("DENIM", "FAST", "Fabric", "INTERLOCK", "KES", "Published", "SWIM_KNIT"),
+        "cloth.constants": ("Cloth", "fabric"),
+        "cloth.moduli": ("Moduli",),
+        "forces.air": ("Air",),
+        "forces.pressure": ("Pressure",),
+        "topology.mesh_checks": ("MeshReport", "examine", "rewound"),
+        "export.surfaces": ("save_obj", "save_stl"),
+    },
     "contact": {
         "contact.base": ("Obstacle",),
         "contact.rule": ("Contact",),

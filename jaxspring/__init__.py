@@ -13,6 +13,7 @@ from ._lazy import face as _face
 from ._version import __version__ as __version__
 
 if TYPE_CHECKING:  # written by `python -m tests.face`
+    from . import cloth as cloth
     from . import contact as contact
     from . import fluid as fluid
     from . import images as images

@@ -70,6 +70,10 @@ PUBLIC: dict[str, dict[str, tuple[str, ...]]] = {
         "inverse.checkpoint": ("Checkpoint",),
         "inverse.check": ("check_gradient",),
     },
+    "cloth": {
+        "forces.hinges": ("Hinges",),
+        "forces.joints": ("AngularJoints",),
+    },
     "contact": {
         "contact.base": ("Obstacle",),
         "contact.rule": ("Contact",),
@@ -119,7 +123,7 @@ PUBLIC: dict[str, dict[str, tuple[str, ...]]] = {
         "linalg.base": ("LinearSolver", "SolveInfo"),
         "linalg.exact": ("ExactSolver",),
         "linalg.lineax_solver": ("Lineax",),
-        "linalg.operators": ("Blocks", "NodeDyads", "SpringBlocks", "SpringMatrix"),
+        "linalg.operators": ("Blocks", "CellDyads", "NodeDyads", "SpringBlocks", "SpringMatrix"),
         "linalg.multigrid": ("Multigrid",),
         "linalg.preconditioners": ("BlockJacobi", "Jacobi", "Preconditioner", "Unpreconditioned"),
         "linalg.envelope": ("Profile",),

@@ -71,6 +71,8 @@ PUBLIC: dict[str, dict[str, tuple[str, ...]]] = {
         "inverse.check": ("check_gradient",),
     },
     "cloth": {
+        "forces.hinges": ("Hinges",),
+        "forces.joints": ("AngularJoints",),
         "cloth.meshes": ("disc", "outline", "provot", "rectangle"),
         "cloth.materials": ("DENIM", "FAST", "Fabric", "INTERLOCK", "KES", "Published", "SWIM_KNIT"),
         "cloth.constants": ("Cloth", "fabric"),
@@ -129,7 +131,7 @@ PUBLIC: dict[str, dict[str, tuple[str, ...]]] = {
         "linalg.base": ("LinearSolver", "SolveInfo"),
         "linalg.exact": ("ExactSolver",),
         "linalg.lineax_solver": ("Lineax",),
-        "linalg.operators": ("Blocks", "NodeDyads", "SpringBlocks", "SpringMatrix"),
+        "linalg.operators": ("Blocks", "CellDyads", "NodeDyads", "SpringBlocks", "SpringMatrix"),
         "linalg.multigrid": ("Multigrid",),
         "linalg.preconditioners": ("BlockJacobi", "Jacobi", "Preconditioner", "Unpreconditioned"),
         "linalg.envelope": ("Profile",),

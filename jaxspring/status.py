@@ -47,9 +47,20 @@ class Flag(enum.IntFlag):
     IMPACTS = 524288
     BOX = 1048576
     INSIDE = 2097152
+    DEGENERATE = 4194304
 
 
-WARNINGS = Flag.COINCIDENT | Flag.OVERLAP | Flag.OUTSIDE | Flag.DT_LIMIT | Flag.PRECISION | Flag.UNDETERMINED | Flag.IMPACTS | Flag.INSIDE
+WARNINGS = (
+    Flag.COINCIDENT
+    | Flag.OVERLAP
+    | Flag.OUTSIDE
+    | Flag.DT_LIMIT
+    | Flag.PRECISION
+    | Flag.UNDETERMINED
+    | Flag.IMPACTS
+    | Flag.INSIDE
+    | Flag.DEGENERATE
+)
 
 EXPLANATION = {
     Flag.NONFINITE: "a position, velocity or temperature is NaN or infinite, or a spring so long that its square is; try a smaller dt "
@@ -74,6 +85,8 @@ EXPLANATION = {
     Flag.IMPACTS: "a node met more obstacles in one step than are followed, and waited at the last one; lower dt",
     Flag.INSIDE: "nodes are inside an obstacle (the deepest is named): they go no deeper and are not lifted; move them out with "
     "js.contact.push_out, or move the obstacle",
+    Flag.DEGENERATE: "an edge without length or a triangle without area, or elements folded onto each other, leave bending without a "
+    "direction, and its moment there was taken as zero",
     Flag.BOX: "the box is too small: a spring has reached half a period, where its pull turns to another image of its node, or a fluid's "
     "cut-off is beyond it; use a larger box, shorter springs or cut-off",
     Flag.INVALID: "a parameter has a value that its constructor would refuse (sign, NaN or infinity)",

@@ -39,6 +39,8 @@ class Corners(eqx.Module):
         rounds: for nodes of very many corners, the tables of further sums: see `end_tables.py`.
         back: (N,) for each node the place of its sum; the last one, of a zero, for nodes at no corner.
         box: (D,) periods of the net [m], or None.
+        pairs: a net with a spring for every pair of each cell's corners, the first of `pairs_of` for all cells, then the second, ...: for
+            matrices whose cells couple their corners. None where nobody asked for it.
         node_shape: of a node array (static).
 
     >>> import jaxspring as js
@@ -56,14 +58,16 @@ class Corners(eqx.Module):
     rounds: tuple[Int[Array, "W rows"], ...]
     back: Int[Array, " N"]
     box: Array | None
+    pairs: Topology | None
     node_shape: tuple[int, ...] = eqx.field(static=True)
 
-    def __init__(self, cells: Any, net: Topology):
+    def __init__(self, cells: Any, net: Topology, with_pairs: bool = False):
         """Make the tables, on the host.
 
         Args:
             cells: (C, m) node numbers in the user's order.
             net: over whose nodes they are.
+            with_pairs: make the net of `pairs`; a node is then at one corner of a cell only.
 
         Raises:
             ValueError: no cell, a node that does not exist.
@@ -87,6 +91,8 @@ class Corners(eqx.Module):
         self.rounds = tuple(jnp.asarray(table, jnp.int32) for table in rounds)
         self.back = jnp.asarray(back, jnp.int32)
         self.box = box_of(net)
+        couples = [given[:, [k, l]] for k, l in pairs_of(given.shape[1])] if with_pairs else []
+        self.pairs = net.with_edges(np.concatenate(couples)) if couples else None
         self.node_shape = net.node_shape
 
     def at(self, field: Any) -> tuple[Any, ...]:
@@ -108,6 +114,26 @@ class Corners(eqx.Module):
         first, *others = self.at(x)
         apart = tuple(other - first for other in others)
         return apart if self.box is None else tuple(minimum_image(d, self.box) for d in apart)
+
+    def coupled(self) -> Topology:
+        """The net of `pairs`.
+
+        Raises:
+            ValueError: the corners were made without.
+        """
+        if self.pairs is None:
+            raise ValueError("these cells couple their corners, which a matrix must know: Corners(cells, net, with_pairs=True).")
+        return self.pairs
+
+    def nodes(self, net: Topology) -> np.ndarray:
+        """(C, m) node numbers in the user's order, for the host; `net` is the one that they were made for."""
+        places = np.asarray(self.cells).T
+        return places if net.node_permutation is None else net.node_permutation.order[places]
+
+
+def pairs_of(m: int) -> list[tuple[int, int]]:
+    """The pairs of m corners: (0, 1), (0, 2), ... (m - 2, m - 1)."""
+    return [(k, l) for k in range(m) for l in range(k + 1, m)]
 
 
 def _read(a: Array, index: Array) -> Array:
@@ -149,4 +175,4 @@ def _tables(places: np.ndarray, n_nodes: int) -> tuple[list[np.ndarray], tuple[n
     return tables, rounds, back
 
 
-__all__ = ["Corners"]
+__all__ = ["Corners", "pairs_of"]

@@ -35,12 +35,12 @@ from ..forces.base import Force
 from ..forces.hinges import Hinges
 from ..forces.joints import AngularJoints
 from ..forces.springs import Springs
-from ..masses import lumped_mass
 from ..topology.base import Topology
+from ..topology.hinge_list import hinges_of
 from ..topology.lattice import Lattice
 from ..topology.mesh_checks import Sides, cut, triangles_of
 from .materials import Fabric, Material
-from .moduli import Moduli, bending, membrane
+from .moduli import Moduli, bending, membrane, twice_areas
 
 # Of the stretch stiffness, the least that is left to structural springs, and to springs and hinges along warp or across it.
 LEAST_STRUCTURAL, LEAST = 0.1, 0.05
@@ -147,14 +147,14 @@ def _on_grid(net: Lattice, places: np.ndarray, f: Fabric) -> Cloth:
         at_border |= same & ((np.abs(tail[:, k] - low) < 0.1 * h) | (np.abs(tail[:, k] - high) < 0.1 * h))
     kind = np.where(across[1], 0, np.where(across[0], 1, 2))
     stiffness = jnp.stack([warp, weft, shear])[kind] * jnp.asarray(np.where(at_border, 0.5, 1.0), f.stretch.dtype)
-    area = float(np.prod(np.ptp(places, axis=0)))
     joints, share = _rows(net)
     along = np.repeat([0, 1], [len(rows) for rows in joints])
     bend = AngularJoints(net, f.bending[along] * jnp.asarray(np.concatenate(share), f.bending.dtype), np.concatenate(joints))
     zero = jnp.zeros((), f.bending.dtype)
     realised = jnp.diag(jnp.stack([f.bending[0], f.bending[1], zero]))
-    halves = [lumped_mass(net, places, f.density, np.concatenate(cut(net, other))) for other in (False, True)]
-    return _cloth(net, places, f, stiffness, bend, realised, 0.5 * (halves[0] + halves[1]), area)
+    # The mean of both ways to cut squares into triangles: with one alone, nodes at two corners would have twice the mass.
+    own = np.mean([_own_area(net, places, np.concatenate(cut(net, other))) for other in (False, True)], axis=0)
+    return _cloth(net, places, f, stiffness, bend, realised, own)
 
 
 def _rows(net: Lattice) -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -172,27 +172,35 @@ def _rows(net: Lattice) -> tuple[list[np.ndarray], list[np.ndarray]]:
 
 def _on_triangles(net: Topology, places: np.ndarray, f: Fabric) -> Cloth:
     triangles = triangles_of(net, None)
-    u, v = (places[triangles[:, k]] - places[triangles[:, 0]] for k in (1, 2))
-    areas = 0.5 * np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
-    around = _area_at(net, triangles, areas)
+    around = _area_at(net, triangles, np.abs(twice_areas(places, triangles)) / 2)
     d = places[net.edges[:, 1]] - places[net.edges[:, 0]]
     squared = np.einsum("ed,ed->e", d, d)
     dtype = f.stretch.dtype
     row, oblique = jnp.maximum(f.stretch[0] - f.stretch[1] / 9, LEAST * f.stretch[0]), f.stretch[1] * (8 / 9)
     stiffness = jnp.asarray(around / squared, dtype) * (oblique + (row - oblique) * jnp.asarray(_near_warp(d), dtype))
-    nodes = Hinges(net, 1.0).nodes
+    nodes = hinges_of(triangles)
     turned = jnp.asarray(_near_warp(places[nodes[:, 1]] - places[nodes[:, 0]]), f.bending.dtype)
     row, oblique = f.bending[1], jnp.maximum((9 * f.bending[0] - f.bending[1]) / 8, LEAST * f.bending[0])
-    bend = Hinges.from_bending(net, places, oblique + (row - oblique) * turned)
+    side = places[nodes[:, 1]] - places[nodes[:, 0]]
+    both = np.abs(twice_areas(places, nodes[:, [0, 1, 2]])) + np.abs(twice_areas(places, nodes[:, [0, 1, 3]]))
+    per_bending = jnp.asarray(2 * np.einsum("hd,hd->h", side, side) / both, f.bending.dtype)
+    bend = Hinges(net, (oblique + (row - oblique) * turned) * per_bending, triangles=triangles)
     realised = bending(bend.stiffness, places, nodes, triangles)
-    mass = lumped_mass(net, places, f.density, triangles)
-    return _cloth(net, places, f, stiffness, bend, realised, mass, float(areas.sum()))
+    return _cloth(net, places, f, stiffness, bend, realised, _own_area(net, places, triangles))
 
 
-def _cloth(net: Topology, places: np.ndarray, f: Fabric, stiffness: Array, bend: Force, realised: Array, mass: Array, area: float) -> Cloth:
-    springs = Springs(net, stiffness, net.lengths(places))
-    moduli = Moduli(membrane(stiffness, places, net.edges, area), realised, jnp.sum(mass) / area)
+def _cloth(net: Topology, places: np.ndarray, f: Fabric, stiffness: Array, bend: Force, realised: Array, own: np.ndarray) -> Cloth:
+    """From the springs' stiffness, the bending and its moduli, and each node's own area."""
+    tail, head = net.edges.T
+    springs = Springs(net, stiffness, jnp.asarray(np.linalg.norm(places[head] - places[tail], axis=1), stiffness.dtype))
+    mass = f.density * jnp.asarray(own, f.density.dtype)
+    moduli = Moduli(membrane(stiffness, places, net.edges, float(own.sum())), realised, jnp.sum(mass) / float(own.sum()))
     return Cloth(f, net, springs, bend, mass, moduli)
+
+
+def _own_area(net: Topology, places: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """(N,) a third of the triangles at each node, as in `lumped_mass`."""
+    return np.bincount(triangles.ravel(), np.repeat(np.abs(twice_areas(places, triangles)) / 6, 3), net.n_nodes)
 
 
 def _near_warp(d: np.ndarray) -> np.ndarray:

@@ -25,6 +25,7 @@ from ..forces.springs import Springs
 from ..topology.builders import from_triangles
 from ..topology.graph import Graph
 from ..topology.lattice import BEND, SHEAR, STRUCTURAL, Lattice, lattice
+from .moduli import twice_areas
 
 # Height of a triangle over its side.
 ROW = math.sqrt(3) / 2
@@ -32,6 +33,8 @@ ROW = math.sqrt(3) / 2
 CLEAR = 0.7
 # Nodes this near to the border, in spacings, are smoothed, so many times.
 SMOOTHED, SWEEPS = 1.8, 12
+# An outline with triangles of smaller angles is refused [degrees].
+LEAST_ANGLE = 5.0
 
 
 def rectangle(width: float, height: float, spacing: float) -> tuple[Graph, np.ndarray]:
@@ -110,7 +113,8 @@ def outline(polygon: Numbers, spacing: float) -> tuple[Graph, np.ndarray]:
         As `rectangle`; nodes of the border come first, counter-clockwise from the first corner.
 
     Raises:
-        ValueError: fewer than three corners, what is not finite, sides that cross or touch, a part narrower than the triangles can fill.
+        ValueError: fewer than three corners, what is not finite, sides that cross or touch, a part too narrow for
+            the spacing, a corner sharper than 5 degrees.
 
     >>> net, points = outline([(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)], 0.25)
     >>> net.n_nodes, net.triangles.shape
@@ -246,18 +250,18 @@ def _filled(border: np.ndarray, spacing: float, middle: np.ndarray) -> tuple[Gra
             total = np.stack([np.bincount(both[:, 0], points[both[:, 1], k], len(points)) for k in range(2)], axis=-1)
             points[moved] = (total / np.maximum(degree, 1)[:, None])[moved]
     triangles = _counterclockwise(points, triangles)
-    _check_border(triangles, len(border), len(points), spacing)
+    _check(points, triangles, len(border), spacing)
     return from_triangles(triangles, len(points)), in_space(points)
 
 
 def _counterclockwise(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    u, v = (points[triangles[:, k]] - points[triangles[:, 0]] for k in (1, 2))
-    turns = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0] < 0
+    turns = twice_areas(points, triangles) < 0
     return np.where(turns[:, None], triangles[:, ::-1], triangles)
 
 
-def _check_border(triangles: np.ndarray, n_border: int, n_nodes: int, spacing: float) -> None:
-    """Raise ValueError unless the triangles end at the border, and use all nodes."""
+def _check(points: np.ndarray, triangles: np.ndarray, n_border: int, spacing: float) -> None:
+    """Raise ValueError unless the triangles end at the border, use all nodes, and none is a sliver."""
+    n_nodes = len(points)
     sides = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]).astype(np.int64)
     there, back = sides[:, 0] * n_nodes + sides[:, 1], sides[:, 1] * n_nodes + sides[:, 0]
     ends = np.sort(there[~np.isin(there, back)])
@@ -267,6 +271,16 @@ def _check_border(triangles: np.ndarray, n_border: int, n_nodes: int, spacing: f
         missing = np.setdiff1d(wanted, ends)
         where = f" near node {missing[0] // n_nodes} of the border" if len(missing) else ""
         raise ValueError(f"triangles with sides of {spacing} m do not fill the outline{where}: it is too narrow. Pass a smaller spacing.")
+    a, b, c = (points[triangles[:, k]] for k in range(3))
+    lengths = np.sort([np.linalg.norm(q - p, axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=0)
+    # The smallest angle is the one across the shortest side.
+    angle = np.degrees(np.arcsin(np.minimum(np.abs(twice_areas(points, triangles)) / (lengths[1] * lengths[2]), 1.0)))
+    if angle.min() < LEAST_ANGLE:
+        x, y = points[triangles[np.argmin(angle)]].mean(axis=0)
+        raise ValueError(
+            f"a triangle near ({x:.6g}, {y:.6g}) would have an angle of {angle.min():.2g} degrees: the outline is too narrow there for "
+            f"sides of {spacing} m. Pass a smaller spacing, or blunt a corner as sharp as that."
+        )
 
 
 def _is_inside(places: np.ndarray, border: np.ndarray) -> np.ndarray:

@@ -2,11 +2,11 @@
 
     strain       (e11, e22, g)    g the angle of shear          W = e' C e / 2    C = sum over springs of k l^2 m m' / area
     curvature    (c11, c22, 2 c12)                              W = c' D c / 2    D = sum over hinges of k t t' / area
-    along n      C(n) = m' C m,  D(n) = m' D m                  m = (n1^2, n2^2, n1 n2)
+    along n      C(n) = s' C s,  D(n) = s' D s                  m = (n1^2, n2^2, n1 n2),  s = (n1^2, n2^2, 2 n1 n2)
 
-t is by how much a hinge turns in each curvature: the jump of the slope of the heights of its four nodes on x^2 / 2, y^2 / 2, x y / 2.
-Strains are those of springs without rest from the flat shape; C is exact for it, border and all. D is that of the triangles that have a
-neighbour at each side, since a free border does not bend.
+m is how a spring along n stretches with the strain, s the strain that stretches along n alone; t is by how much a hinge turns in each
+curvature: the jump of the slope of the heights of its four nodes on x^2 / 2, y^2 / 2, x y / 2. C is that of the whole sheet, border and
+all. D is that of the triangles that have a neighbour at each side, since a free border does not bend.
 
 Source: the affine energy of a spring lattice, e.g. Ostoja-Starzewski (2002), "Lattice models in micromechanics".
 """
@@ -76,7 +76,7 @@ def bending(stiffness: Array, points: np.ndarray, hinges: np.ndarray, triangles:
     inner = (hinge >= 0).all(axis=0)
     if not inner.any():
         raise ValueError("no triangle has a neighbour at each side, so that the mesh is too coarse to bend. Pass a smaller spacing.")
-    area = np.abs(_twice_area(points, triangles[inner])).sum() / 2
+    area = np.abs(twice_areas(points, triangles[inner])).sum() / 2
     # A hinge belongs to its two triangles in halves.
     weight = np.bincount(hinge[:, inner].ravel(), minlength=len(hinges)) / (2 * area)
     t = jnp.asarray(turns * np.sqrt(weight)[:, None], stiffness.dtype)
@@ -92,7 +92,8 @@ def _slope(points: np.ndarray, corners: np.ndarray, heights: np.ndarray) -> np.n
     return (heights[corners[:, 2]] - on_line) / distance[:, None]
 
 
-def _twice_area(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+def twice_areas(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """(T,) twice the area of triangles between places in the plane, negative where they turn clockwise."""
     u, v = (points[triangles[:, k]] - points[triangles[:, 0]] for k in (1, 2))
     return u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
 
@@ -100,8 +101,8 @@ def _twice_area(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 def _along(matrix: Array, angle: ArrayLike) -> Array:
     angle = as_inexact("angle", angle, matrix.dtype)
     c, s = jnp.cos(angle), jnp.sin(angle)
-    m = jnp.stack([c * c, s * s, c * s], axis=-1)
-    return jnp.sum(m * jnp.matmul(m, matrix), axis=-1)
+    strain = jnp.stack([c * c, s * s, 2 * c * s], axis=-1)
+    return jnp.sum(strain * jnp.matmul(strain, matrix), axis=-1)
 
 
 def _every(matrix: Array) -> Array:
@@ -113,4 +114,4 @@ def _spread(values: Array) -> Array:
     return jnp.max(values) / jnp.min(values)
 
 
-__all__ = ["Moduli", "bending", "membrane"]
+__all__ = ["Moduli", "bending", "membrane", "twice_areas"]

@@ -74,6 +74,17 @@ def number(value: float) -> np.ndarray:
 
 
 DOORS: dict[str, Door] = {
+    "AngularJoints": Door(
+        lambda **a: js.cloth.AngularJoints(js.lattice(N), **a),
+        {
+            "stiffness": np.array([1.0, 2.0]),
+            "joints": np.array([[0, 1, 2], [1, 2, 3]]),
+            "clamp": np.array([1.0, 0.5]),
+            "ends": np.array([[0, 1]]),
+            "clamp_stiffness": number(3.0),
+        },
+        on_host=("joints", "ends"),
+    ),
     "Box": Door(js.contact.Box, {"centre": np.array([0.0, 1.0]), "half_sizes": np.array([1.0, 2.0])}),
     "Capsule": Door(js.contact.Capsule, {"a": np.array([0.0, 1.0]), "b": np.array([1.0, 2.0]), "radius": number(0.5)}),
     "Actuation": Door(
@@ -112,6 +123,11 @@ DOORS: dict[str, Door] = {
     "HalfSpaces": Door(js.contact.HalfSpaces, {"points": np.zeros((2, 2)), "normals": np.array([[0.0, 1.0], [2.0, 0.0]])}),
     "Heat": Door(lambda **a: js.Heat(net(), **a), {"capacity": per_node(), "conductance": per_spring(), "source": per_node()}),
     "HeatFlux": Door(lambda **a: js.thermal.HeatFlux(net(), **a), {"nodes": PATTERN, "flux": per_node(), "area": per_node()}),
+    "Hinges": Door(
+        lambda **a: js.cloth.Hinges(js.lattice(N), **a),
+        {"stiffness": number(2.0), "rest_angle": np.array([0.5]), "triangles": TRIANGLES},
+        on_host=("triangles",),
+    ),
     "HotPlane": Door(
         js.thermal.HotPlane,
         {
@@ -179,6 +195,7 @@ DOORS: dict[str, Door] = {
     "Oscillators": Door(js.robot.Oscillators, {"amplitude": per_spring(), "phase": per_spring(0.5), "frequency": number(2.0)}),
     "PixelSprings": Door(lambda stiffness: js.reconstruction.PixelSprings(cast(Any, None), stiffness), {"stiffness": number(2.0)}),
     "Plane": Door(js.contact.Plane, {"point": np.array([0.0, 1.0]), "normal": np.array([0.0, 2.0])}),
+    "PlasticHinges": Door(lambda **a: js.cloth.PlasticHinges(net(), **a), {"yield_angle": np.array([0.5, 0.25]), "hardening": number(0.5)}),
     "PlainCutoff": Door(js.fluid.PlainCutoff, {"radius": number(2.5)}),
     "Radiation": Door(
         lambda **a: js.thermal.Radiation(net(), **a),
@@ -250,7 +267,7 @@ BY_HAND = {"diffeqsolve", "fit", "check_gradient", "frequency_response", "from_n
 
 # What the library makes and hands out; nobody else builds it.
 MADE_INSIDE = """
-    Account Blocks Body BoundSystem Energy Equilibrium Finding Fit GradientCheck History Impulse Iteration Memory Modes
+    Account Blocks Body BoundSystem CellDyads Creased Energy Equilibrium Finding Fit GradientCheck History Impulse Iteration Memory Modes
     NetBatch NodeDyads OdeInfo OdeResult Onset Overlay Profile Reconstructed Result Resume Scene Selection SkylineFactor
     SolveInfo Solves SpringBlocks SpringMatrix Status Step Surface Torn Undetermined Yielded
 """

@@ -30,6 +30,7 @@ LAYERS = {
     "numbering": 5,  # what a file holds of nodes and springs
     "forces": 3,
     "contact": 3,
+    "cloth": 3,
     "thermal": 3,
     "fluid": 3,  # public names of forces
     "plasticity": 3,  # as well

@@ -487,6 +487,7 @@ def instances():
     )
     pixels, robot = js.reconstruction.PixelSprings(None, 1.0), js.robot.walking_robot(js.robot.RobotSettings(body=("#",)))
     field = TWO.edge_field(jnp.ones(1))
+    fold = js.cloth.Hinges(js.from_triangles([(0, 1, 2), (1, 0, 3)], 4), 1.0)
     classes = [
         js.thermal.Account(number, number, number, number, number, number),
         *(js.Adam(), js.LBFGS(), js.LeastSquares(), js.inverse.Optax(optax.identity()), js.Stop()),
@@ -641,6 +642,8 @@ def instances():
             js.plasticity.Onset(whole, whole, number),
         ),
         *(js.plasticity.Yielded(field, field, field), js.plasticity.Torn(field, None, None)),
+        *(fold, js.cloth.PlasticHinges(fold.net, 0.5), js.cloth.Creased(number, number, number)),
+        *(js.cloth.AngularJoints(js.lattice(3), 1.0), js.linalg.CellDyads(fold.triangles, (), ())),
         *(robot, robot.settings, robot.controller, js.robot.body_of_cells(("#",), 1.0)),
         *(js.robot.Oscillators([0.1], [0.0], 1.0), js.robot.Actuation(js.robot.Oscillators([0.1], [0.0], 1.0), [0])),
     ]

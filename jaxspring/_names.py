@@ -73,6 +73,8 @@ PUBLIC: dict[str, dict[str, tuple[str, ...]]] = {
     "cloth": {
         "forces.hinges": ("Hinges",),
         "forces.joints": ("AngularJoints",),
+        "forces.plastic_hinges": ("PlasticHinges",),
+        "forces.history": ("Creased",),
         "cloth.meshes": ("disc", "outline", "provot", "rectangle"),
         "cloth.materials": ("DENIM", "FAST", "Fabric", "INTERLOCK", "KES", "Published", "SWIM_KNIT"),
         "cloth.constants": ("Cloth", "fabric"),

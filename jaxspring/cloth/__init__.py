@@ -9,6 +9,8 @@ from .._lazy import face as _face
 if TYPE_CHECKING:  # written by `python -m tests.face`
     from ..forces.hinges import Hinges as Hinges
     from ..forces.joints import AngularJoints as AngularJoints
+    from ..forces.plastic_hinges import PlasticHinges as PlasticHinges
+    from ..forces.history import Creased as Creased
     from .meshes import disc as disc
     from .meshes import outline as outline
     from .meshes import provot as provot

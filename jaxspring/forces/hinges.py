@@ -31,6 +31,7 @@ from ..topology.hinge_list import hinges_of
 from ..vector import Vector
 from .base import Finding, Force, any_refused
 from .dihedral import Dihedral, cross, dihedral, wrapped
+from .history import Creased, remembered
 from .linearisation import ExactTangent, Linearisation
 
 
@@ -47,14 +48,14 @@ class Hinges(Force):
     Attributes:
         net: whose nodes are bent.
         stiffness: k_e, moment per angle [N m]: one number, or (H,) in the order of `nodes`.
-        rest_angle: theta_0 [rad]; as the stiffness.
+        rest_angle: theta_0 [rad]; as the stiffness. `PlasticHinges` adds to it.
         triangles: the corners of the hinges.
 
     >>> import jaxspring as js
     >>> net = js.from_triangles([(0, 1, 2), (1, 0, 3)], 4)
     >>> hinges = js.cloth.Hinges(net, stiffness=0.5)
     >>> bent = js.State.from_points(net, [(0, 0, 0), (1, 0, 0), (0.5, 1, 0), (0.5, 0, 1)])
-    >>> print(hinges.nodes, hinges.angles(bent).round(4), hinges.energy(bent).round(4))
+    >>> print(hinges.nodes, hinges.angles(bent).round(4), f"{hinges.energy(bent):.4f}")
     [[0 1 2 3]] [-1.5708] 0.6169
     """
 
@@ -67,7 +68,7 @@ class Hinges(Force):
         self,
         net: Topology,
         stiffness: Numbers,
-        rest_angle: Numbers = 0.0,
+        rest_angle: Numbers | None = None,
         triangles: Numbers | Corners | None = None,
         rest_points: Numbers | None = None,
     ):
@@ -76,7 +77,7 @@ class Hinges(Force):
         Args:
             net: whose nodes are bent.
             stiffness: k_e [N m]: one number, or (H,), one per hinge.
-            rest_angle: [rad]: one number, or (H,). Zero is flat.
+            rest_angle: [rad]: one number, or (H,). None is flat, zero.
             triangles: (T, 3) node numbers; None takes the triangles of the net.
             rest_points: (N, D) places [m] whose angles are the rest angles.
 
@@ -87,11 +88,11 @@ class Hinges(Force):
         self.net = net
         self.triangles = triangles if isinstance(triangles, Corners) else _corners(net, triangles)
         if rest_points is not None:
-            if not (is_concrete(rest_angle) and np.ndim(rest_angle) == 0 and rest_angle == 0):
+            if rest_angle is not None:
                 raise ValueError("rest_angle and rest_points are both given: rest angles are those of the points. Leave one out.")
             rest_angle = _in_space(self.triangles, net, rest_points).angle
         self.stiffness = self._constant("stiffness", stiffness)
-        self.rest_angle = self._constant("rest_angle", rest_angle)
+        self.rest_angle = self._constant("rest_angle", 0.0 if rest_angle is None else rest_angle)
         nonnegative("stiffness", self.stiffness, "A hinge of negative stiffness folds by itself.")
 
     @staticmethod
@@ -140,25 +141,29 @@ class Hinges(Force):
         """(H,) theta of each hinge [rad], in (-pi, pi]; 0 where degenerate."""
         return wrapped(self._now(state).angle)
 
+    def bent(self, state: State) -> Array:
+        """(H,) angle of each hinge from that at rest [rad], in (-pi, pi]; 0 where degenerate."""
+        return self._turned(state, self._now(state))
+
     def moments(self, state: State) -> Array:
         """(H,) moment of each hinge, k_e (theta - theta_0) [N m]; 0 where degenerate."""
-        return self._bent(state)[1]
+        return self._moments(state)[1]
 
     def force(self, state: State) -> Vector:
         """Sum of the forces of the hinges at each node [N]."""
-        now, moment = self._bent(state)
+        now, moment = self._moments(state)
         return self.triangles.sum(tuple(-moment * g for g in now.gradient))
 
     def energy(self, state: State) -> Array:
         """k_e / 2 (theta - theta_0)^2, summed [J]."""
         now = self._now(state)
-        k, turned = self._turned(state, now)
-        return jnp.sum(jnp.where(now.is_degenerate, jnp.zeros_like(turned), 0.5 * k * turned * turned))
+        turned = self._turned(state, now)
+        return jnp.sum(0.5 * self._stiffness(state, now) * turned * turned)
 
     def stiffness_blocks(self, state: State, linearisation: Linearisation) -> Blocks:
         """Blocks k_e g g' of all four corners [N/m]; for `ExactTangent` with the moment times the second derivative of the angle."""
-        now, moment = self._bent(state)
-        k = jnp.where(now.is_degenerate, jnp.zeros_like(moment), self._turned(state, now)[0])
+        now, moment = self._moments(state)
+        k = self._stiffness(state, now)
         dyads = [(k, now.gradient)]
         if isinstance(linearisation, ExactTangent):
             dyads += [(factor * moment, g) for factor, g in now.second]
@@ -167,8 +172,8 @@ class Hinges(Force):
 
     def stiffness_bound(self, state: State) -> Array:
         """Upper bound of the row sums: k_e |g_i| sum of |g_j|, and the moment times that of the second derivative [N/m]."""
-        now, moment = self._bent(state)
-        k = jnp.where(now.is_degenerate, jnp.zeros_like(moment), self._turned(state, now)[0])
+        now, moment = self._moments(state)
+        k = self._stiffness(state, now)
         sizes = tuple(g.norm() for g in now.gradient)
         total = k * (sizes[0] + sizes[1] + sizes[2] + sizes[3])
         rows = (total * size + jnp.abs(moment) * more for size, more in zip(sizes, now.second_bound, strict=True))
@@ -200,16 +205,22 @@ class Hinges(Force):
             raise ValueError(f"Hinges bend in space and need positions of 3 coordinates; these have {state.dim}.")
         return dihedral(*self.triangles.apart(state.position))
 
-    def _turned(self, state: State, now: Dihedral) -> tuple[Array, Array]:
-        """Stiffness, and angle from that at rest, of each hinge."""
-        k, rest = (jnp.broadcast_to(a.astype(state.dtype), now.angle.shape) for a in (self.stiffness, self.rest_angle))
-        return k, wrapped(now.angle - rest)
+    def _stiffness(self, state: State, now: Dihedral) -> Array:
+        """(H,) stiffness of each hinge, 0 where degenerate."""
+        k = jnp.broadcast_to(self.stiffness.astype(state.dtype), now.angle.shape)
+        return jnp.where(now.is_degenerate, jnp.zeros_like(k), k)
 
-    def _bent(self, state: State) -> tuple[Dihedral, Array]:
+    def _turned(self, state: State, now: Dihedral) -> Array:
+        """(H,) angle of each hinge from that at rest, 0 where degenerate."""
+        rest = jnp.broadcast_to(self.rest_angle.astype(state.dtype), now.angle.shape)
+        for creased in remembered(self.net, state, Creased):
+            rest = rest + creased.angle
+        return jnp.where(now.is_degenerate, jnp.zeros_like(rest), wrapped(now.angle - rest))
+
+    def _moments(self, state: State) -> tuple[Dihedral, Array]:
         """The hinges, and the moment of each."""
         now = self._now(state)
-        k, turned = self._turned(state, now)
-        return now, jnp.where(now.is_degenerate, jnp.zeros_like(turned), k * turned)
+        return now, self._stiffness(state, now) * self._turned(state, now)
 
 
 def _corners(net: Topology, triangles: Any) -> Corners:

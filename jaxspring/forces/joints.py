@@ -59,7 +59,7 @@ class AngularJoints(Force):
     >>> chain = js.lattice(3)
     >>> joints = js.cloth.AngularJoints(chain, stiffness=0.5)
     >>> bent = js.State.from_points(chain, [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0)])
-    >>> print(joints.angles(bent).round(4), joints.energy(bent).round(4))
+    >>> print(joints.angles(bent).round(4), f"{joints.energy(bent):.4f}")
     [1.5708] 0.6169
     """
 

@@ -303,7 +303,9 @@ DOORS: dict[str, Door] = {
         on_host=("points", "triangles"),
     ),
     "fabric": Door(
-        lambda points: js.cloth.fabric(sheet(), points, js.cloth.DENIM).mass, {"points": np.pad(SQUARE, ((0, 0), (0, 1)))}, on_host=("points",)
+        lambda points: js.cloth.fabric(sheet(), points, js.cloth.DENIM).mass,
+        {"points": np.pad(SQUARE, ((0, 0), (0, 1)))},
+        on_host=("points",),
     ),
     "from_scipy": Door(js.topology.from_scipy, {"matrix": np.array([[0.0, 2.0], [2.0, 0.0]])}, on_host=("matrix",)),
     "from_triangles": Door(lambda triangles: js.from_triangles(triangles, N), {"triangles": TRIANGLES}, on_host=("triangles",)),
@@ -336,7 +338,19 @@ DOORS: dict[str, Door] = {
 }
 
 # Doors whose work is too long for every form of every field: tested by hand below or elsewhere.
-BY_HAND = {"diffeqsolve", "fit", "check_gradient", "frequency_response", "from_networkx", "plot", "save_obj", "save_ply", "save_stl", "save_vtk", "save_xyz"}
+BY_HAND = {
+    "diffeqsolve",
+    "fit",
+    "check_gradient",
+    "frequency_response",
+    "from_networkx",
+    "plot",
+    "save_obj",
+    "save_ply",
+    "save_stl",
+    "save_vtk",
+    "save_xyz",
+}
 
 # What the library makes and hands out; nobody else builds it.
 MADE_INSIDE = """

@@ -8,13 +8,16 @@ Square grid of spacing h, structural springs k1 (warp) and k2 (weft), both diago
 Triangles, springs along their sides and hinges across them, at an angle a from warp, S the area of the triangles at a side of length l:
 
     k = S / l^2 [e1 + (e0 - e1) f(a)]           f(a) = ((4 cos^2 a - 1) / 3)^2:  1 along warp, 0 at 60 degrees
-    B = b1 + (b0 - b1) f(a)                     k_e = B l^2 / S
-    e1 = 8/9 C22,  e0 = C11 - C22 / 9           b0 = B2,  b1 = (9 B1 - B2) / 8
+    k_e = l^2 / S [b1 + (b0 - b1) f(a)]
 
-On equilateral triangles with rows along warp this gives C11, C22, B1 and B2 as asked, and C12 = C33 = C22 / 3; for C11 = C22 it is
-isotropic, nu = 1/3, k = sqrt(3)/2 C11 (1 - nu^2). A hinge of a side along warp bends weft alone; the other two bend both ways. e0 and b1
-are kept above a twentieth of C11 and B1. No springs give C12 another value than C33, and hinges have a Poisson's ratio of -1/3 of their
-own: what comes out, and what was asked, is in `Cloth`.
+e0 and e1 are such that the whole sheet has C11 and C22 as asked, b0 and b1 such that its inner triangles have B1 and B2: two equations of
+two unknowns each, by the energies in `moduli.py`. On equilateral triangles with rows along warp they are
+
+    e1 = 8/9 C22,  e0 = C11 - C22 / 9           C12 = C33 = C22 / 3;  for C11 = C22 isotropic, nu = 1/3, k = sqrt(3)/2 C11 (1 - nu^2)
+    b0 = B2,  b1 = (9 B1 - B2) / 8              Poisson's ratio -1/3;  a hinge along warp bends weft alone, the others bend both ways
+
+All four are kept above a twentieth of what was asked along them. No springs give C12 another value than C33. What comes out, and what was
+asked, is in `Cloth`.
 
 Source: Cauchy's relations for central forces; Van Gelder (1998), "Approximate simulation of elastic membranes by triangulated spring
 meshes", for S / l^2; the rest from the energies in `moduli.py`.
@@ -40,10 +43,12 @@ from ..topology.hinge_list import hinges_of
 from ..topology.lattice import Lattice
 from ..topology.mesh_checks import Sides, cut, triangles_of
 from .materials import Fabric, Material
-from .moduli import Moduli, bending, membrane, twice_areas
+from .moduli import Moduli, matrix, stretches, turns, twice_areas
 
 # Of the stretch stiffness, the least that is left to structural springs, and to springs and hinges along warp or across it.
 LEAST_STRUCTURAL, LEAST = 0.1, 0.05
+# A fit of two moduli is refused where their equations are this badly conditioned.
+ILL_POSED = 1e9
 # Sides of a grid may differ by this share of one.
 EVEN = 1e-5
 
@@ -106,7 +111,7 @@ def fabric(net: Topology, points: Numbers, material: Material) -> Cloth:
     Differentiable in the fabric's constants, not in the points.
 
     Args:
-        net: of triangles, as `js.cloth.rectangle`, `disc`, `outline` and `js.from_mesh` make, best equilateral with a row along x; or a
+        net: of triangles, as `js.cloth.rectangle`, `disc`, `outline` and `js.from_mesh` make, best equilateral with rows along x; or a
             square `js.lattice((ny, nx), js.STRUCTURAL + js.SHEAR)`.
         points: (N, 2) or (N, 3) places at rest [m], flat: warp runs along x, weft along y.
         material: a `Fabric`, `KES` or `FAST`, or one of the published ones, such as `js.cloth.INTERLOCK`.
@@ -120,14 +125,14 @@ def fabric(net: Topology, points: Numbers, material: Material) -> Cloth:
     >>> net, points = js.cloth.rectangle(0.3, 0.3, 0.02)
     >>> print(fabric(net, points, js.cloth.DENIM))
                   asked   realised
-    C11           205.4      218.5
-    C12           10.23      341.8
-    C22            1014       1045
-    C33           26.69      341.8
-    B warp     6.42e-05  6.376e-05
+    C11           205.4      205.4
+    C12           10.23      317.1
+    C22            1014       1014
+    C33           26.69      317.1
+    B warp     6.42e-05   6.42e-05
     B weft    1.982e-05  1.982e-05
     density       0.324      0.324
-    anisotropy of stretch 4.78, of bending 3.21
+    anisotropy of stretch 4.94, of bending 3.67
     """
     made_of, places = material.fabric(), _flat(net, points)
     if isinstance(net, Lattice):
@@ -172,21 +177,26 @@ def _rows(net: Lattice) -> tuple[list[np.ndarray], list[np.ndarray]]:
 
 def _on_triangles(net: Topology, places: np.ndarray, f: Fabric) -> Cloth:
     triangles = triangles_of(net, None)
-    around = _area_at(net, triangles, np.abs(twice_areas(places, triangles)) / 2)
-    d = places[net.edges[:, 1]] - places[net.edges[:, 0]]
-    squared = np.einsum("ed,ed->e", d, d)
-    dtype = f.stretch.dtype
-    row, oblique = jnp.maximum(f.stretch[0] - f.stretch[1] / 9, LEAST * f.stretch[0]), f.stretch[1] * (8 / 9)
-    stiffness = jnp.asarray(around / squared, dtype) * (oblique + (row - oblique) * jnp.asarray(_near_warp(d), dtype))
+    own = _own_area(net, places, triangles)
+    sides = places[net.edges[:, 1]] - places[net.edges[:, 0]]
+    per_modulus = _area_at(net, triangles, np.abs(twice_areas(places, triangles)) / 2) / np.einsum("ed,ed->e", sides, sides)
+    stiffness = _fitted(f.stretch, per_modulus, _near_warp(sides), stretches(places, net.edges, float(own.sum())))
     nodes = hinges_of(triangles)
-    turned = jnp.asarray(_near_warp(places[nodes[:, 1]] - places[nodes[:, 0]]), f.bending.dtype)
-    row, oblique = f.bending[1], jnp.maximum((9 * f.bending[0] - f.bending[1]) / 8, LEAST * f.bending[0])
-    side = places[nodes[:, 1]] - places[nodes[:, 0]]
+    edges = places[nodes[:, 1]] - places[nodes[:, 0]]
     both = np.abs(twice_areas(places, nodes[:, [0, 1, 2]])) + np.abs(twice_areas(places, nodes[:, [0, 1, 3]]))
-    per_bending = jnp.asarray(2 * np.einsum("hd,hd->h", side, side) / both, f.bending.dtype)
-    bend = Hinges(net, (oblique + (row - oblique) * turned) * per_bending, triangles=triangles)
-    realised = bending(bend.stiffness, places, nodes, triangles)
-    return _cloth(net, places, f, stiffness, bend, realised, _own_area(net, places, triangles))
+    rows = turns(places, nodes, triangles)
+    bend = Hinges(net, _fitted(f.bending, 2 * np.einsum("hd,hd->h", edges, edges) / both, _near_warp(edges), rows), triangles=triangles)
+    return _cloth(net, places, f, stiffness, bend, matrix(bend.stiffness, rows), own)
+
+
+def _fitted(asked: Array, per_modulus: np.ndarray, near_warp: np.ndarray, rows: np.ndarray) -> Array:
+    """Stiffness of each spring, or hinge, such that the sheet has both moduli as asked, where that needs none too small."""
+    shares = per_modulus * np.stack([near_warp, 1 - near_warp])
+    gives = np.einsum("ce,ei->ic", shares, rows[:, :2] ** 2)
+    if np.linalg.cond(gives) > ILL_POSED:
+        raise ValueError("all sides of the triangles lie at one angle to warp, so that warp and weft cannot differ. Turn the pattern.")
+    found = jnp.matmul(jnp.asarray(np.linalg.inv(gives), asked.dtype), asked)
+    return jnp.matmul(jnp.maximum(found, LEAST * asked), jnp.asarray(shares, asked.dtype))
 
 
 def _cloth(net: Topology, places: np.ndarray, f: Fabric, stiffness: Array, bend: Force, realised: Array, own: np.ndarray) -> Cloth:
@@ -194,7 +204,7 @@ def _cloth(net: Topology, places: np.ndarray, f: Fabric, stiffness: Array, bend:
     tail, head = net.edges.T
     springs = Springs(net, stiffness, jnp.asarray(np.linalg.norm(places[head] - places[tail], axis=1), stiffness.dtype))
     mass = f.density * jnp.asarray(own, f.density.dtype)
-    moduli = Moduli(membrane(stiffness, places, net.edges, float(own.sum())), realised, jnp.sum(mass) / float(own.sum()))
+    moduli = Moduli(matrix(stiffness, stretches(places, net.edges, float(own.sum()))), realised, jnp.sum(mass) / float(own.sum()))
     return Cloth(f, net, springs, bend, mass, moduli)
 
 

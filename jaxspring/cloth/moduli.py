@@ -52,24 +52,27 @@ class Moduli(eqx.Module):
         return _spread(self.bending_along(_every(self.bending)))
 
 
-def membrane(stiffness: Array, points: np.ndarray, edges: np.ndarray, area: float) -> Array:
-    """C of springs (E,) between places in the plane."""
+def matrix(stiffness: Array, rows: np.ndarray) -> Array:
+    """C or D of springs or hinges of these stiffnesses, by what each does in the three strains: the sum of k r r'."""
+    r = jnp.asarray(rows, stiffness.dtype)
+    return jnp.einsum("e,ei,ej->ij", stiffness, r, r)
+
+
+def stretches(points: np.ndarray, edges: np.ndarray, area: float) -> np.ndarray:
+    """(E, 3) l m / sqrt(area) of springs between places in the plane."""
     d = points[edges[:, 1]] - points[edges[:, 0]]
-    # k l^2 m m' with m of the unit vector: k / l^2 times that of the difference itself.
-    squared = np.einsum("ed,ed->e", d, d)
-    m = np.stack([d[:, 0] ** 2, d[:, 1] ** 2, d[:, 0] * d[:, 1]], axis=-1) / np.sqrt(squared)[:, None]
-    m = jnp.asarray(m / np.sqrt(area), stiffness.dtype)
-    return jnp.einsum("e,ei,ej->ij", stiffness, m, m)
+    m = np.stack([d[:, 0] ** 2, d[:, 1] ** 2, d[:, 0] * d[:, 1]], axis=-1)
+    return m / np.sqrt(np.einsum("ed,ed->e", d, d) * area)[:, None]
 
 
-def bending(stiffness: Array, points: np.ndarray, hinges: np.ndarray, triangles: np.ndarray) -> Array:
-    """D of hinges (H,) of four nodes: the edge from a to b, and both opposite corners.
+def turns(points: np.ndarray, hinges: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """(H, 3) t / sqrt(area) of hinges of four nodes, the edge from a to b and both opposite corners, over the inner triangles.
 
     Raises:
         ValueError: no triangle has a neighbour at each side.
     """
     x, y = points.T
-    turns = sum(_slope(points, hinges[:, [0, 1, k]], np.stack([x * x, y * y, x * y], axis=-1) / 2) for k in (2, 3))
+    turned = sum(_slope(points, hinges[:, [0, 1, k]], np.stack([x * x, y * y, x * y], axis=-1) / 2) for k in (2, 3))
     sides = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
     known = {tuple(pair): i for i, pair in enumerate(np.sort(hinges[:, :2], axis=1).tolist())}
     hinge = np.array([known.get(tuple(pair), -1) for pair in sides.tolist()]).reshape(3, -1)
@@ -79,8 +82,7 @@ def bending(stiffness: Array, points: np.ndarray, hinges: np.ndarray, triangles:
     area = np.abs(twice_areas(points, triangles[inner])).sum() / 2
     # A hinge belongs to its two triangles in halves.
     weight = np.bincount(hinge[:, inner].ravel(), minlength=len(hinges)) / (2 * area)
-    t = jnp.asarray(turns * np.sqrt(weight)[:, None], stiffness.dtype)
-    return jnp.einsum("h,hi,hj->ij", stiffness, t, t)
+    return turned * np.sqrt(weight)[:, None]
 
 
 def _slope(points: np.ndarray, corners: np.ndarray, heights: np.ndarray) -> np.ndarray:
@@ -114,4 +116,4 @@ def _spread(values: Array) -> Array:
     return jnp.max(values) / jnp.min(values)
 
 
-__all__ = ["Moduli", "bending", "membrane", "twice_areas"]
+__all__ = ["Moduli", "matrix", "stretches", "turns", "twice_areas"]

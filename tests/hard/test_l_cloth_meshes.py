@@ -1,5 +1,7 @@
 """Hard cases L7 and L11: bad meshes, and pressure in what is not closed or inside out."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -22,7 +24,7 @@ def moebius(n=10):
         ((1 + s * np.cos(a / 2)) * np.cos(a), (1 + s * np.cos(a / 2)) * np.sin(a), s * np.sin(a / 2)) for a in turn for s in (-0.3, 0.3)
     ]
     rows = [(2 * i, 2 * i + 1) for i in range(n)] + [(1, 0)]
-    triangles = [t for (a, b), (c, d) in zip(rows, rows[1:], strict=False) for t in ((a, b, d), (a, d, c))]
+    triangles = [t for (a, b), (c, d) in itertools.pairwise(rows) for t in ((a, b, d), (a, d, c))]
     return js.from_triangles(triangles, 2 * n), np.array(points)
 
 

@@ -251,7 +251,7 @@ def test_a_gas_follows_boyle():
 def test_a_balloon_stands_by_laplace():
     """At rest each half is held by its cut springs, exactly; tension p R / 2 gives the radius of the closed form within a percent.
 
-    Springs of stiffness E S / l^2 (nu = 1/3) under an even strain e have the energy 4/3 C e^2 per area, C = 9/8 E, so p R (1 + e)^2 = 8/3 C e.
+    Springs of stiffness E S / l^2 (nu = 1/3) under an even strain e have the energy 4/3 C e^2 per area, C = 9/8 E: p R (1 + e)^2 = 8/3 C e.
     """
     net, points = sphere(2)
     edges = net.edges
@@ -285,3 +285,33 @@ def test_a_balloon_stands_by_laplace():
     vectors = np.cross(x[net.triangles[:, 1]] - x[net.triangles[:, 0]], x[net.triangles[:, 2]] - x[net.triangles[:, 0]]) / 2
     pushed = p * (up[net.triangles].sum(axis=1) / 3) @ vectors
     np.testing.assert_allclose(held + pushed, 0, atol=1e-8 * np.abs(pushed).max())
+
+
+def test_transforms_and_single_precision():
+    """Batches of winds and pressures give what each gives; the Hessian of the energy is minus the Jacobian of the force; float32 agrees."""
+    tetrahedron = js.from_triangles([(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)], 4)
+    corners = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0.1, 0.2, 1.0)])
+
+    def both(p, x, dtype=np.float64):
+        air = js.cloth.Air(tetrahedron, drag=1.2, friction=0.1, lift=0.2, viscous=p, wind=jnp.stack([p, 2 * p, -p]))
+        parts = js.cloth.Pressure.of_gas(tetrahedron, corners, 10.0 * p), air
+        system = js.System(tetrahedron, np.ones(4, dtype), parts)
+        state = js.State.from_points(tetrahedron, jnp.asarray(x, dtype), jnp.asarray(-x, dtype))
+        return jnp.stack([tetrahedron.flatten_nodes(a) for a in system.force(state)], axis=-1), parts[0]
+
+    ps, x = jnp.array([0.5, 1.0, 2.0]), jnp.asarray(1.1 * corners)
+    batch = jax.jit(jax.vmap(lambda p: both(p, x)[0]))(ps)
+    single = jax.jit(lambda p: both(p, x)[0])
+    for p, found in zip(ps, batch, strict=True):
+        np.testing.assert_allclose(found, single(p), rtol=1e-11, atol=1e-12 * 101325)
+    gas = both(1.0, x)[1]
+
+    def of(method):
+        return lambda x: method(js.State.from_points(tetrahedron, x))
+
+    hessian = jax.jit(jax.hessian(of(gas.energy)))(x)
+    jacobian = jax.jit(jax.jacfwd(lambda x: jnp.stack([tetrahedron.flatten_nodes(a) for a in of(gas.force)(x)], axis=-1)))(x)
+    np.testing.assert_allclose(hessian, -jacobian, rtol=1e-10, atol=1e-6)
+    low = both(np.float32(1.0), np.asarray(x, np.float32), np.float32)[0]
+    assert low.dtype == np.float32
+    np.testing.assert_allclose(low, both(1.0, x)[0], rtol=3e-5, atol=0.05)

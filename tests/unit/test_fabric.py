@@ -79,6 +79,9 @@ def test_realised_membrane_is_the_energy_of_homogeneous_strains(make):
         np.testing.assert_allclose(found, strain_energy(cloth.springs, flat, strain), rtol=2e-6)
     np.testing.assert_allclose(cloth.realised.density, 0.15, rtol=1e-13)
     np.testing.assert_allclose(cloth.springs.rest_length, net.lengths(flat), rtol=1e-14)
+    # Warp and weft are as asked on every mesh, its border included.
+    np.testing.assert_allclose(np.diag(cloth.realised.membrane)[:2], STRETCH, rtol=1e-9)
+    np.testing.assert_allclose(np.diag(cloth.realised.bending)[:2], BEND, rtol=1e-9)
 
 
 def test_masses_and_hinges_are_those_of_the_plate():
@@ -86,6 +89,8 @@ def test_masses_and_hinges_are_those_of_the_plate():
     net, points = js.cloth.disc(0.15, 0.04)
     cloth = js.cloth.fabric(net, points, js.cloth.Fabric(0.15, 300.0, 60.0, 3e-5))
     np.testing.assert_allclose(cloth.mass, js.lumped_mass(net, points, 0.15, net.triangles), rtol=1e-13)
+    net, points = hexagon(0.25)
+    cloth = js.cloth.fabric(net, points, js.cloth.Fabric(0.15, 300.0, 60.0, 3e-5))
     np.testing.assert_allclose(cloth.bending.stiffness, js.cloth.Hinges.from_bending(net, points, 3e-5).stiffness, rtol=1e-12)
 
 
@@ -148,7 +153,8 @@ def test_hinges_of_a_square_grid_are_not_isotropic():
     net = js.lattice((12, 12))
     points, triangles = net.grid(0.1), np.concatenate(cut(net))
     hinges = js.cloth.Hinges.from_bending(net, points, 1.0, triangles)
-    d = moduli.Moduli(jnp.eye(3), moduli.bending(hinges.stiffness, points, hinges.nodes, triangles), jnp.ones(()))
+    realised = moduli.matrix(hinges.stiffness, moduli.turns(points, hinges.nodes, triangles))
+    d = moduli.Moduli(jnp.eye(3), realised, jnp.ones(()))
     angles = np.radians([0, 90, 45, -45])
     found = np.asarray(d.bending_along(angles))
     assert sorted(found.round(9)) == [1.0, 1.0, 1.0, 3.0]

@@ -39,7 +39,7 @@ PUBLIC: dict[str, dict[str, tuple[str, ...]]] = {
         "images.files": ("load_image",),
         "forces.base": ("Finding", "Force", "Rule", "Scene", "Step"),
         "forces.laws": ("EnergyLaw", "Hooke", "Law", "PowerLaw", "PullLaw", "TensionOnly"),
-        "forces.springs": ("ExpansionRule", "Springs", "StiffnessRule"),
+        "forces.springs": ("Springs", "StiffnessRule"),
         "forces.contact": ("Floor",),
         "forces.adaptive": ("ImageStiffness",),
         "forces.damping": ("Dashpots", "Drag"),
@@ -164,6 +164,7 @@ PUBLIC: dict[str, dict[str, tuple[str, ...]]] = {
         "forces.linearisation": ("ExactTangent", "Linearisation", "Secant", "Tangent"),
     },
     "thermal": {
+        "forces.springs": ("ExpansionRule",),
         "thermal.backward": ("HeatIteration",),
         "thermal.boundaries": ("Convection", "FixedTemperature", "HeatFlux", "Radiation", "ThermalBoundary"),
         "thermal.cells": ("Cells", "EqualCells", "HalfCells", "capacities"),

@@ -35,7 +35,6 @@ LAYERS = {
     "plasticity": 3,  # as well
     "cloth": 7,  # public names of forces, meshes, fabrics, and files of surfaces
     "masses": 4,
-    "cloth": 4,  # what a cloth is made of
     "nodes": 4,
     "bound": 4,
     "system": 4,

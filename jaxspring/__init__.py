@@ -84,7 +84,6 @@ if TYPE_CHECKING:  # written by `python -m tests.face`
     from .forces.laws import PowerLaw as PowerLaw
     from .forces.laws import PullLaw as PullLaw
     from .forces.laws import TensionOnly as TensionOnly
-    from .forces.springs import ExpansionRule as ExpansionRule
     from .forces.springs import Springs as Springs
     from .forces.springs import StiffnessRule as StiffnessRule
     from .forces.contact import Floor as Floor

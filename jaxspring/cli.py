@@ -23,6 +23,7 @@ SCENES = (
     "reconstruction",
     "melting",
     "robot",
+    "cloth",
 )
 
 

@@ -48,6 +48,7 @@ class Flag(enum.IntFlag):
     BOX = 1048576
     INSIDE = 2097152
     STRAIN = 4194304
+    DEGENERATE = 8388608
 
 
 WARNINGS = (
@@ -60,6 +61,7 @@ WARNINGS = (
     | Flag.IMPACTS
     | Flag.INSIDE
     | Flag.STRAIN
+    | Flag.DEGENERATE
 )
 
 EXPLANATION = {
@@ -86,6 +88,8 @@ EXPLANATION = {
     Flag.INSIDE: "nodes are inside an obstacle (the deepest is named): they go no deeper and are not lifted; move them out with "
     "js.contact.push_out, or move the obstacle",
     Flag.STRAIN: "springs stay stretched beyond their limit: their ends may be held too far apart; else raise sweeps, or lower dt",
+    Flag.DEGENERATE: "an edge without length or a triangle without area, or elements folded onto each other, leave bending without a "
+    "direction, and its moment there was taken as zero",
     Flag.BOX: "the box is too small: a spring has reached half a period, where its pull turns to another image of its node, or a fluid's "
     "cut-off is beyond it; use a larger box, shorter springs or cut-off",
     Flag.INVALID: "a parameter has a value that its constructor would refuse (sign, NaN or infinity)",

@@ -34,6 +34,8 @@ class Door:
 N, E = 4, 3
 TRIANGLES = np.array([[0, 1, 2], [1, 2, 3]])
 SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.1, 1.0]])
+TETRAHEDRON = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+CORNER = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 PIXELS = np.arange(1.0, 31.0).reshape(5, 6)
 PATTERN = np.array([True, False, True, True])
 
@@ -41,6 +43,11 @@ PATTERN = np.array([True, False, True, True])
 def net() -> js.Lattice:
     """A chain of four nodes."""
     return js.lattice(N)
+
+
+def sheet() -> js.Graph:
+    """Two triangles of four nodes."""
+    return js.from_triangles(TRIANGLES, N)
 
 
 def image() -> js.Image:
@@ -74,8 +81,32 @@ def number(value: float) -> np.ndarray:
 
 
 DOORS: dict[str, Door] = {
+    "AngularJoints": Door(
+        lambda **a: js.cloth.AngularJoints(js.lattice(N), **a),
+        {
+            "stiffness": np.array([1.0, 2.0]),
+            "joints": np.array([[0, 1, 2], [1, 2, 3]]),
+            "clamp": np.array([1.0, 0.5]),
+            "ends": np.array([[0, 1]]),
+            "clamp_stiffness": number(3.0),
+        },
+        on_host=("joints", "ends"),
+    ),
     "Box": Door(js.contact.Box, {"centre": np.array([0.0, 1.0]), "half_sizes": np.array([1.0, 2.0])}),
     "Capsule": Door(js.contact.Capsule, {"a": np.array([0.0, 1.0]), "b": np.array([1.0, 2.0]), "radius": number(0.5)}),
+    "Air": Door(
+        lambda **a: js.cloth.Air(sheet(), **a),
+        {
+            "drag": np.array([1.0, 2.0]),
+            "friction": np.array([0.25, 0.5]),
+            "lift": np.array([0.25, 0.5]),
+            "viscous": np.array([0.25, 0.5]),
+            "density": number(1.25),
+            "wind": np.array([1.0, 2.0, 3.0]),
+            "triangles": TRIANGLES,
+        },
+        on_host=("triangles",),
+    ),
     "Actuation": Door(
         lambda **a: js.robot.Actuation(repr, **a),
         {"groups": np.array([0, -1, 1]), "low": number(0.5), "high": number(1.25)},
@@ -103,6 +134,25 @@ DOORS: dict[str, Door] = {
         {"point": np.array([0.0, 1.0]), "normal": np.array([0.0, 2.0]), "friction": number(0.25), "restitution": number(0.5)},
     ),
     "Fluid": Door(lambda core: js.Fluid(js.fluid.SlideLaw(1.0, 1.0), core=core), {"core": number(0.125)}),
+    "FAST": Door(
+        js.cloth.FAST,
+        {
+            "weight": number(120.0),
+            "extension": np.array([1.5, 3.0]),
+            "bias": number(2.5),
+            "bending_length": np.array([18.0, 16.0]),
+        },
+    ),
+    "Fabric": Door(
+        js.cloth.Fabric,
+        {
+            "density": number(0.25),
+            "stretch": np.array([100.0, 50.0]),
+            "shear": number(20.0),
+            "bending": np.array([0.5, 0.25]),
+            "coupling": number(10.0),
+        },
+    ),
     "Fusing": Door(lambda melting: js.Fusing(net(), melting), {"melting": number(350.0)}),
     "Graph": Door(
         lambda edges, triangles, box: js.Graph.from_edges(edges, N, triangles=triangles, box=box),
@@ -113,6 +163,11 @@ DOORS: dict[str, Door] = {
     "HalfSpaces": Door(js.contact.HalfSpaces, {"points": np.zeros((2, 2)), "normals": np.array([[0.0, 1.0], [2.0, 0.0]])}),
     "Heat": Door(lambda **a: js.Heat(net(), **a), {"capacity": per_node(), "conductance": per_spring(), "source": per_node()}),
     "HeatFlux": Door(lambda **a: js.thermal.HeatFlux(net(), **a), {"nodes": PATTERN, "flux": per_node(), "area": per_node()}),
+    "Hinges": Door(
+        lambda **a: js.cloth.Hinges(js.lattice(N), **a),
+        {"stiffness": number(2.0), "rest_angle": np.array([0.5]), "triangles": TRIANGLES},
+        on_host=("triangles",),
+    ),
     "HotPlane": Door(
         js.thermal.HotPlane,
         {
@@ -139,6 +194,15 @@ DOORS: dict[str, Door] = {
     "ImageAttraction": Door(lambda strength: js.ImageAttraction(image(), strength), {"strength": number(2.0)}),
     "ImageStiffness": Door(
         lambda **a: js.ImageStiffness(image(), radius=4, **a), {"k_min": number(1.0), "k_max": number(9.0), "sigma": number(1.0)}
+    ),
+    "KES": Door(
+        js.cloth.KES,
+        {
+            "weight": number(18.0),
+            "extension": np.array([4.0, 6.0]),
+            "shear": number(0.5),
+            "bending": np.array([0.5, 0.25]),
+        },
     ),
     "LatentHeat": Door(js.thermal.LatentHeat, {"melting": per_node(350), "latent": per_node()}),
     "LennardJones": Door(js.fluid.LennardJones, {"epsilon": number(2.0), "sigma": number(0.5)}),
@@ -180,7 +244,19 @@ DOORS: dict[str, Door] = {
     "Oscillators": Door(js.robot.Oscillators, {"amplitude": per_spring(), "phase": per_spring(0.5), "frequency": number(2.0)}),
     "PixelSprings": Door(lambda stiffness: js.reconstruction.PixelSprings(cast(Any, None), stiffness), {"stiffness": number(2.0)}),
     "Plane": Door(js.contact.Plane, {"point": np.array([0.0, 1.0]), "normal": np.array([0.0, 2.0])}),
+    "PlasticHinges": Door(lambda **a: js.cloth.PlasticHinges(net(), **a), {"yield_angle": np.array([0.5, 0.25]), "hardening": number(0.5)}),
     "PlainCutoff": Door(js.fluid.PlainCutoff, {"radius": number(2.5)}),
+    "Pressure": Door(
+        lambda **a: js.cloth.Pressure(sheet(), **a),
+        {
+            "points": CORNER,
+            "pressure": number(10.0),
+            "volume": number(0.25),
+            "ambient": number(100.0),
+            "triangles": TETRAHEDRON,
+        },
+        on_host=("points", "triangles"),
+    ),
     "Radiation": Door(
         lambda **a: js.thermal.Radiation(net(), **a),
         {"nodes": PATTERN, "emissivity": per_node(0.125), "ambient": per_node(280), "area": per_node()},
@@ -224,6 +300,16 @@ DOORS: dict[str, Door] = {
         lambda **a: js.thermal.conductances(net(), **a), {"conductivity": per_node(), "spacing": number(0.5), "section": number(2.0)}
     ),
     "delaunay": Door(js.delaunay, {"points": SQUARE}, on_host=("points",)),
+    "examine": Door(
+        lambda **a: jnp.asarray(js.cloth.examine(sheet(), **a).volumes),
+        {"points": CORNER, "triangles": TETRAHEDRON},
+        on_host=("points", "triangles"),
+    ),
+    "fabric": Door(
+        lambda points: js.cloth.fabric(sheet(), points, js.cloth.DENIM).mass,
+        {"points": np.pad(SQUARE, ((0, 0), (0, 1)))},
+        on_host=("points",),
+    ),
     "from_scipy": Door(js.topology.from_scipy, {"matrix": np.array([[0.0, 2.0], [2.0, 0.0]])}, on_host=("matrix",)),
     "from_triangles": Door(lambda triangles: js.from_triangles(triangles, N), {"triangles": TRIANGLES}, on_host=("triangles",)),
     "gentle_fluid": Door(js.fluid.gentle_fluid, {"spacing": number(0.5), "zeta": number(0.25), "alpha": number(2.0)}),
@@ -237,8 +323,14 @@ DOORS: dict[str, Door] = {
         {"points": SQUARE, "density": number(2.0), "triangles": TRIANGLES},
         on_host=("triangles",),
     ),
+    "outline": Door(lambda polygon: js.cloth.outline(polygon, 0.5)[0].ends, {"polygon": SQUARE[[0, 1, 3, 2]]}, on_host=("polygon",)),
+    "provot": Door(
+        lambda **a: js.cloth.provot((3, 3), 0.5, **a)[2].stiffness,
+        {"stretch": np.array([100.0, 50.0]), "shear": number(20.0), "flexion": np.array([2.0, 1.0])},
+    ),
     "replace": Door(lambda **a: js.replace(system(), **a), {"stiffness": per_spring(), "rest_length": per_spring(), "mass": per_node()}),
     "rollout": Door(lambda dt: js.rollout(system(), state(), js.SymplecticEuler(), dt, 2).state, {"dt": number(0.0625)}),
+    "rewound": Door(lambda points: js.cloth.rewound(sheet(), points).ends, {"points": CORNER}, on_host=("points",)),
     "smooth": Door(lambda sigma: js.images.smooth(image(), sigma, radius=4), {"sigma": number(1.0)}),
     "walking_robot": Door(
         lambda **a: js.robot.walking_robot(net=js.from_triangles(TRIANGLES, N), **a),
@@ -249,30 +341,43 @@ DOORS: dict[str, Door] = {
 }
 
 # Doors whose work is too long for every form of every field: tested by hand below or elsewhere.
-BY_HAND = {"diffeqsolve", "fit", "check_gradient", "frequency_response", "from_networkx", "plot", "save_ply", "save_vtk", "save_xyz"}
+BY_HAND = {
+    "diffeqsolve",
+    "fit",
+    "check_gradient",
+    "frequency_response",
+    "from_networkx",
+    "plot",
+    "save_obj",
+    "save_ply",
+    "save_stl",
+    "save_vtk",
+    "save_xyz",
+}
 
 # What the library makes and hands out; nobody else builds it.
 MADE_INSIDE = """
-    Account Blocks Body BoundSystem Energy Equilibrium Finding Fit GradientCheck History Impulse Iteration Memory Modes
-    NetBatch NodeDyads OdeInfo OdeResult Onset Overlay Profile Reconstructed Result Resume Scene Selection SkylineFactor
-    SolveInfo Solves SpringBlocks SpringMatrix Status Step Surface Torn Undetermined Yielded
+    Account Blocks Body BoundSystem CellDyads Cloth Creased Energy Equilibrium Finding Fit GradientCheck History Impulse
+    Iteration Memory MeshReport Modes Moduli NetBatch NodeDyads OdeInfo OdeResult Onset Overlay Profile Reconstructed
+    Result Resume Scene Selection SkylineFactor SolveInfo Solves SpringBlocks SpringMatrix Status Step Surface Torn
+    Undetermined Yielded
 """
 
 # Objects made of options, other objects, functions or files: no array of the user's enters.
 NO_ARRAYS = """
-    AllPairs Adam BDF2 BackwardEuler BackwardEulerHeat Bilinear BlockJacobi Bounded CG Cells Channel Checkpoint CheckpointError
-    Checkpointed ConstantsSettings CrankNicolsonHeat CubicSpline Curvature Cutoff EnergyLaw EqualCells ExactSolver ExactTangent
-    ExpansionRule ExplicitHeat Flag Force ForwardEuler GradientMagnitude GradientWarning HalfCells HeatIteration
-    HeatScheme HeightField Hooke Identity ImageError ImplicitMidpoint Impulses Intensity Jacobi JaxCG LBFGS Lattice Law
-    LeastSquares Ledger LinearSolver Linearisation Lineax Luminance Molten Moving Multigrid Natural NeuralController
-    Newton NoCutoff Observation Obstacle Optax Optimiser Ordering PairLaw Pairs Positive PowerLaw Preconditioner
-    Progress PullLaw Reconstruction Relaxation ReverseCuthillMcKee Robot RobotSettings Rule RungeKutta4 Sampling Secant
-    SemiImplicit SignedDistance SimulationError Skyline SoftPositive SplitHeat SpringSettings StabilityWarning Stepper
-    StiffnessRule Still Stop StopReason StoreAll StoreStates SymmetricSplitHeat SymplecticEuler Tangent TensionOnly
-    ThermalBoundary Topology Transform Unpreconditioned VelocityVerlet animate batch body_of_cells distance domain
-    elevation_model energy_ledger equilibrium fit_constants fit_springs from_mesh gradient_magnitude impulses load
-    load_image melted_fraction normal_modes pad_nets principal_curvatures push_out raise_for_status save save_trajectory
-    select smoothing_radius stable_dt total_heat train walk
+    Adam AllPairs BDF2 BackwardEuler BackwardEulerHeat Bilinear BlockJacobi Bounded CG Cells Channel Checkpoint
+    CheckpointError Checkpointed ConstantsSettings CrankNicolsonHeat CubicSpline Curvature Cutoff EnergyLaw EqualCells
+    ExactSolver ExactTangent ExpansionRule ExplicitHeat Flag Force ForwardEuler GradientMagnitude GradientWarning
+    HalfCells HeatIteration HeatScheme HeightField Hooke Identity ImageError ImplicitMidpoint Impulses Intensity Jacobi
+    JaxCG LBFGS Lattice Law LeastSquares Ledger LinearSolver Linearisation Lineax Luminance Molten Moving Multigrid
+    Natural NeuralController Newton NoCutoff Observation Obstacle Optax Optimiser Ordering PairLaw Pairs Positive
+    PowerLaw Preconditioner Progress Published PullLaw Reconstruction Relaxation ReverseCuthillMcKee Robot RobotSettings
+    Rule RungeKutta4 Sampling Secant SemiImplicit SignedDistance SimulationError Skyline SoftPositive SplitHeat
+    SpringSettings StabilityWarning Stepper StiffnessRule Still Stop StopReason StoreAll StoreStates SymmetricSplitHeat
+    SymplecticEuler Tangent TensionOnly ThermalBoundary Topology Transform Unpreconditioned VelocityVerlet animate batch
+    body_of_cells disc distance domain elevation_model energy_ledger equilibrium fit_constants fit_springs from_mesh
+    gradient_magnitude impulses load load_image melted_fraction normal_modes pad_nets principal_curvatures push_out
+    raise_for_status rectangle save save_trajectory select smoothing_radius stable_dt total_heat train walk
 """
 
 

@@ -13,7 +13,7 @@ from ..archive import Path, atomic_file, atomic_folder
 from .frames import Frames
 
 # Endings that are taken for a file's where a folder is wanted.
-OF_FILES = {".extxyz", ".npz", ".ply", ".pvd", ".vtk", ".vtp", ".vtu", ".xyz"}
+OF_FILES = {".extxyz", ".npz", ".obj", ".ply", ".pvd", ".stl", ".vtk", ".vtp", ".vtu", ".xyz"}
 
 
 def file_place(path: Path, suffixes: tuple[str, ...], reader: str) -> pathlib.Path:

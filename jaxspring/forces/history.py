@@ -2,6 +2,7 @@
 
     rest length    l + e_p       e_p plastic stretch [m]                  left by `Yielding`
     stiffness      s k           s share of the stiffness that is left    left by `Tearing` with a band
+    rest angle     theta_0 + q   q plastic angle of a hinge [rad]         left by `PlasticHinges`
 
 Several rules on one net act in a row: their stretches add up, and their shares multiply. A state in which nothing of the kind is
 remembered adds no operation.
@@ -52,8 +53,22 @@ class Torn(eqx.Module):
     share: EdgeField | None
 
 
+class Creased(eqx.Module):
+    """What `PlasticHinges` remembers of each hinge, in the order of `Hinges.nodes`.
+
+    Attributes:
+        angle: by how much its rest angle has changed [rad].
+        slip: a, the sum of all that it has changed by, forth and back [rad].
+        since: time of the step in which it first yielded [s], infinite where it never has.
+    """
+
+    angle: Array
+    slip: Array
+    since: Array
+
+
 class Onset(eqx.Module):
-    """How many springs have yielded or torn, and where it began.
+    """How many springs (or hinges) have yielded or torn, and where it began.
 
     Attributes:
         count: how many have, ever (0-d integer).
@@ -68,7 +83,11 @@ class Onset(eqx.Module):
     @staticmethod
     def of(net: Topology, since: EdgeField) -> Onset:
         """From the time of each spring."""
-        flat = net.flatten(since) if net.n_springs else jnp.full(1, jnp.inf)
+        return Onset.first(net.flatten(since) if net.n_springs else jnp.full(1, jnp.inf))
+
+    @staticmethod
+    def first(flat: Array) -> Onset:
+        """From an array of times."""
         first = jnp.argmin(flat).astype(jnp.int32)
         has_begun = jnp.isfinite(flat)
         count = jnp.sum(has_begun, dtype=jnp.int32)
@@ -102,9 +121,12 @@ def remembered(net: Topology, state: State, kind: type[Kind]) -> list[Kind]:
 
 
 def of_springs(state: State) -> list[Array]:
-    """Whatever of a state rules change for good and springs read: which hold, rest lengths, plastic stretch, shares of the stiffness."""
+    """Whatever of a state rules change for good and forces read: which springs hold, rest lengths, plastic stretch, shares of the
+    stiffness, rest angles.
+    """
     values = [entry.value for entry in state.memory or () if entry is not None]
     read = [v.stretch if isinstance(v, Yielded) else v.share for v in values if isinstance(v, Yielded | Torn)]
+    read += [v.angle for v in values if isinstance(v, Creased)]
     return jax.tree.leaves((state.alive, state.rest_length, read))
 
 
@@ -122,4 +144,4 @@ def begun(net: Topology, since: EdgeField, now: EdgeField, time: Array) -> EdgeF
     return net.map_springs(moment, since, now)
 
 
-__all__ = ["Onset", "Torn", "Yielded", "begun", "has_yielded", "lengthened", "never", "of_springs", "remembered", "weakened"]
+__all__ = ["Creased", "Onset", "Torn", "Yielded", "begun", "has_yielded", "lengthened", "never", "of_springs", "remembered", "weakened"]

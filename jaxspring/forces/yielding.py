@@ -118,15 +118,12 @@ class Yielding(SpringRule):
         more = () if self.viscosity is None else (self.constant("viscosity", state),)
 
         def slipped(f: Array, k: Array, a: Array, y: Array, h: Array, *eta: Array) -> Array:
-            over = jnp.abs(f) - y - h * a
-            yields = (over >= 0) & (k + h > 0)
-            stiff = jnp.where(yields, k + h, jnp.ones_like(over))
-            slip = jnp.where(yields, f * _sign(f) - y - h * a, jnp.zeros_like(over)) / stiff
+            slip, stiff = at_once(f, k, a, y, h)
             return slip * -jnp.expm1(-dt.astype(f.dtype) * stiff / eta[0]) if eta else slip
 
         slip = map_living(self.net, state, slipped, *given, *more)
         new = Yielded(
-            map_living(self.net, state, lambda q, f, dg: q + _sign(f) * dg, memory.stretch, pull, slip),
+            map_living(self.net, state, lambda q, f, dg: q + sign(f) * dg, memory.stretch, pull, slip),
             map_living(self.net, state, lambda a, dg: a + dg, memory.slip, slip),
             begun(self.net, memory.since, slip.map(lambda dg: dg > 0), state.time),
         )
@@ -168,9 +165,17 @@ def _constant(net: Topology, name: str, value: SpringNumbers | None) -> Any:
     return found
 
 
-def _sign(f: Array) -> Array:
+def at_once(f: Array, k: Array, a: Array, y: Array, h: Array) -> tuple[Array, Array]:
+    """Slip that brings a trial pull back to the yield surface, zero inside of it; and k + H, 1 where nothing yields."""
+    over = jnp.abs(f) - y - h * a
+    yields = (over >= 0) & (k + h > 0)
+    stiff = jnp.where(yields, k + h, jnp.ones_like(over))
+    return jnp.where(yields, f * sign(f) - y - h * a, jnp.zeros_like(over)) / stiff, stiff
+
+
+def sign(f: Array) -> Array:
     """-1 or 1, never 0: a spring of yield force zero has a derivative where it is not pulled."""
     return jnp.where(f < 0, -jnp.ones_like(f), jnp.ones_like(f))
 
 
-__all__ = ["Yielding"]
+__all__ = ["Yielding", "at_once", "sign"]

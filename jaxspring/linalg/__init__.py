@@ -12,6 +12,7 @@ if TYPE_CHECKING:  # written by `python -m tests.face`
     from .exact import ExactSolver as ExactSolver
     from .lineax_solver import Lineax as Lineax
     from .operators import Blocks as Blocks
+    from .operators import CellDyads as CellDyads
     from .operators import NodeDyads as NodeDyads
     from .operators import SpringBlocks as SpringBlocks
     from .operators import SpringMatrix as SpringMatrix

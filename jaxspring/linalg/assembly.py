@@ -17,7 +17,7 @@ from ..topology.base import NodeLayout, Topology
 from ..topology.identity import NetIdentity
 from ..topology.permutation import Permutation
 from .envelope import Panels
-from .operators import SpringBlocks, SpringMatrix
+from .operators import CellDyads, SpringBlocks, SpringMatrix
 
 Group = tuple[int, ...]
 Alike = tuple[Group, ...]
@@ -32,13 +32,14 @@ class SpringPlaces:
         net: what tells the net from others: its springs, and how its nodes are numbered inside.
         later: (E,) place of the later end, springs in the user's order.
         earlier: (E,) place of the earlier end.
+        is_tail_later: (E,) whether the later end is the tail.
     """
 
     def __init__(self, net: Topology, places: np.ndarray):
         place = np.argsort(places)
         ends = place[net.edges]
         self.net = _key(net)
-        self.later, self.earlier = ends.max(axis=1), ends.min(axis=1)
+        self.later, self.earlier, self.is_tail_later = ends.max(axis=1), ends.min(axis=1), ends[:, 0] > ends[:, 1]
         self._digest = hashlib.sha256(ends.tobytes()).hexdigest()
 
     def __hash__(self) -> int:
@@ -80,18 +81,13 @@ def alike_coordinates(matrix: SpringMatrix) -> tuple[Alike, ...]:
 def _couplings(matrix: SpringMatrix) -> list[Group]:
     everything = tuple(range(matrix.dim))
     springs = [term.axes or everything for term in matrix.blocks.springs if term.slope is not None]
-    return springs + [everything for _ in matrix.blocks.dyads]
+    return springs + [everything for _ in (*matrix.blocks.dyads, *matrix.blocks.cells)]
 
 
 def _signature(matrix: SpringMatrix, i: int) -> tuple:
     diagonals = tuple(id(d[i]) for d in matrix.blocks.diagonal)
     springs = tuple(term.axes is None or i in term.axes for term in matrix.blocks.springs)
     return (id(matrix.free[i]), diagonals, springs)
-
-
-def spring_terms(matrix: SpringMatrix) -> tuple[SpringBlocks, ...]:
-    """The terms that hold springs."""
-    return tuple(term for term in matrix.blocks.springs if term.net.n_springs)
 
 
 def read_entries(matrix: SpringMatrix, group: Group, nodes: Permutation, springs: tuple[SpringPlaces, ...]) -> Array:
@@ -106,15 +102,23 @@ def read_entries(matrix: SpringMatrix, group: Group, nodes: Permutation, springs
     parts = [eliminated(matrix.entry(group[a], group[b])) for a in range(len(group)) for b in range(a + 1)]
     masks = [matrix.free[i] for i in group]
     free = [None if mask is None else eliminated(mask) for mask in masks]
-    for term, spring in zip(spring_terms(matrix), springs, strict=True):
+    for term, spring in zip(matrix.blocks.pairs, springs, strict=True):
         for a, i in enumerate(group):
             for b, j in enumerate(group):
-                found = term.entry(i, j)
-                value = jnp.zeros(term.net.n_springs, matrix.like.dtype) if found is None else -term.net.flatten(found)
+                value = _later_earlier(term, spring, i, j)
+                value = jnp.zeros(term.net.n_springs, matrix.like.dtype) if value is None else value
                 for mask, ends in ((free[a], spring.later), (free[b], spring.earlier)):
                     value = value if mask is None else jnp.where(mask[ends], value, jnp.zeros((), value.dtype))
                 parts.append(value)
     return jnp.concatenate(parts)
+
+
+def _later_earlier(term: SpringBlocks | CellDyads, spring: SpringPlaces, i: int, j: int) -> Array | None:
+    """(E,) entries in row i of the later end and column j of the earlier one; None where all are zero."""
+    found = term.across(i, j)
+    if i == j or isinstance(term, SpringBlocks) or found is None:
+        return found
+    return jnp.where(spring.is_tail_later, found, term.across(j, i))
 
 
 def entry_addresses(panels: Panels, springs: tuple[SpringPlaces, ...]) -> Array:
@@ -139,7 +143,7 @@ def store_entries(entries: Array, addresses: Array, panels: Panels) -> Array:
     return stored.reshape(panels.size, panels.total)
 
 
-def find_places(places: tuple[SpringPlaces, ...], term: SpringBlocks) -> SpringPlaces:
+def find_places(places: tuple[SpringPlaces, ...], term: SpringBlocks | CellDyads) -> SpringPlaces:
     """The ends of a term's springs. Raises ValueError where the analysis did not see their net."""
     wanted = _key(term.net)
     for spring in places:
@@ -147,7 +151,7 @@ def find_places(places: tuple[SpringPlaces, ...], term: SpringBlocks) -> SpringP
             return spring
     raise ValueError(
         f"The matrix holds {term.net.n_springs} springs of a net that this Skyline was not made for, so its envelope may have no room for "
-        f"them. Make it for every net that the forces use: Skyline(net, other_net)."
+        f"them. Make it for every net that the forces use: Skyline(net, other_net); of hinges and joints that is their `pairs`."
     )
 
 
@@ -159,6 +163,5 @@ __all__ = [
     "entry_addresses",
     "find_places",
     "read_entries",
-    "spring_terms",
     "store_entries",
 ]

@@ -1,10 +1,10 @@
 """The matrices of implicit steps, applied without assembling anything: `SpringMatrix`.
 
-    A = diag(c) + sum over nodes of s g g' + sum over springs of D' B D,        B = w I + s u u'
+    A = diag(c) + sum over nodes and cells of s g g' + sum over springs of D' B D,        B = w I + s u u'
 
-`D` takes differences along springs, `u` is a spring's direction, `g` a node's. `M/dt + G + dt K` has this form: a spring gives its
-weight w and slope s (see `forces/laws.py`), a dashpot a slope alone, masses and drag a diagonal. A coordinate that is held has an
-identity row and column: a product and a solve leave it alone, exactly.
+`D` takes differences along springs, `u` is a spring's direction, `g` a node's, or that of all corners of a cell. `M/dt + G + dt K` has
+this form: a spring gives its weight w and slope s (see `forces/laws.py`), a dashpot a slope alone, masses and drag a diagonal, bending a
+slope for the corners of a hinge. A coordinate that is held has an identity row and column: a product and a solve leave it alone, exactly.
 
 Source: slide "Implicit Solution"; blocks as in Baraff and Witkin (1998), section 4.
 """
@@ -20,6 +20,7 @@ from jax import lax
 from jaxtyping import Array
 
 from ..topology.base import NodeLayout, Topology
+from ..topology.corners import Corners, pairs_of
 from ..topology.edge_field import EdgeField
 from ..vector import Vector
 
@@ -76,6 +77,11 @@ class SpringBlocks(eqx.Module):
         along = self.net.map_springs(lambda s, u: s * u[i] * u[j], self.slope, self.direction)
         return self.weight + along if i == j else along
 
+    def across(self, i: int, j: int) -> Array | None:
+        """(E,) entry of the matrix in row i of each spring's tail, column j of its head, in the user's order; None where all are zero."""
+        found = self.entry(i, j)
+        return None if found is None else -self.net.flatten(found)
+
     def scaled(self, factor: Array | float) -> SpringBlocks:
         """The same springs with every block times `factor`."""
         scaled = eqx.tree_at(lambda b: b.weight, self, self.weight * factor)
@@ -102,21 +108,67 @@ class NodeDyads(eqx.Module):
         return NodeDyads(self.slope * factor, self.direction)
 
 
+class CellDyads(eqx.Module):
+    """Blocks s g g' over all corners of every cell, several for each: bending, where a motion of one corner loads all of them.
+
+    Attributes:
+        corners: of the cells, with their pairs.
+        slopes: for each dyad s, (C,).
+        directions: for each dyad and corner g, a `Vector` of (C,).
+    """
+
+    corners: Corners
+    slopes: tuple[Array, ...]
+    directions: tuple[tuple[Vector, ...], ...]
+
+    @property
+    def net(self) -> Topology:
+        """A net of every pair of a cell's corners, for solvers that store entries."""
+        return self.corners.coupled()
+
+    def product(self, v: Vector) -> Vector:
+        """The sum of s g (g . v)."""
+        at, total = self.corners.at(v), None
+        for s, g in zip(self.slopes, self.directions, strict=True):
+            amount = s * sum((a.dot(b) for a, b in zip(g[1:], at[1:], strict=True)), start=g[0].dot(at[0]))
+            here = tuple(amount * a for a in g)
+            total = here if total is None else tuple(a + b for a, b in zip(total, here, strict=True))
+        return Vector.zeros_like(v) if total is None else self.corners.sum(total)
+
+    def entry(self, i: int, j: int) -> Array:
+        """Entry (i, j) of every node's own block, in node shape."""
+        return self.corners.sum(tuple(self._sum_of(k, i, k, j) for k in range(len(self.corners.cells))))
+
+    def across(self, i: int, j: int) -> Array:
+        """(E,) entry of the matrix in row i of the first and column j of the second corner of each pair."""
+        return jnp.concatenate([self._sum_of(k, i, l, j) for k, l in pairs_of(len(self.corners.cells))])
+
+    def scaled(self, factor: Array | float) -> CellDyads:
+        """Every block times `factor`."""
+        return CellDyads(self.corners, tuple(s * factor for s in self.slopes), self.directions)
+
+    def _sum_of(self, k: int, i: int, l: int, j: int) -> Array:
+        parts = [s * g[k][i] * g[l][j] for s, g in zip(self.slopes, self.directions, strict=True)]
+        return sum(parts[1:], start=parts[0])
+
+
 class Blocks(eqx.Module):
-    """A sum of node and spring blocks: what a force adds to a matrix.
+    """A sum of node, spring and cell blocks: what a force adds to a matrix.
 
     Attributes:
         diagonal: tuple of `Vector`s in node shape (or of a 0-d array per coordinate), added on the diagonal.
         dyads: blocks of nodes.
         springs: blocks of springs.
+        cells: blocks of cells.
     """
 
     diagonal: tuple[Vector, ...] = ()
     dyads: tuple[NodeDyads, ...] = ()
     springs: tuple[SpringBlocks, ...] = ()
+    cells: tuple[CellDyads, ...] = ()
 
     def __add__(self, other: Blocks) -> Blocks:
-        return Blocks(self.diagonal + other.diagonal, self.dyads + other.dyads, self.springs + other.springs)
+        return Blocks(self.diagonal + other.diagonal, self.dyads + other.dyads, self.springs + other.springs, self.cells + other.cells)
 
     def scaled(self, factor: Array | float) -> Blocks:
         """Every block times `factor`."""
@@ -124,14 +176,20 @@ class Blocks(eqx.Module):
             tuple(factor * d for d in self.diagonal),
             tuple(d.scaled(factor) for d in self.dyads),
             tuple(s.scaled(factor) for s in self.springs),
+            tuple(c.scaled(factor) for c in self.cells),
         )
+
+    @property
+    def pairs(self) -> tuple[SpringBlocks | CellDyads, ...]:
+        """The terms that couple pairs of nodes."""
+        return tuple(term for term in (*self.springs, *self.cells) if term.net.n_springs)
 
     def product(self, v: Vector) -> Vector:
         """The product with a `Vector` in node shape, no coordinate held."""
         total = Vector.zeros_like(v)
         for d in self.diagonal:
             total = total + Vector(tuple(c * a for c, a in zip(d, v, strict=True)))
-        for term in (*self.dyads, *self.springs):
+        for term in (*self.dyads, *self.springs, *self.cells):
             total = total + term.product(v)
         return total
 
@@ -161,7 +219,7 @@ class SpringMatrix(eqx.Module):
     @property
     def is_scalar(self) -> bool:
         """Whether the coordinates decouple by construction: no spring or node block has an entry off its diagonal."""
-        return not self.blocks.dyads and all(term.slope is None for term in self.blocks.springs)
+        return not (self.blocks.dyads or self.blocks.cells) and all(term.slope is None for term in self.blocks.springs)
 
     def __call__(self, v: Vector) -> Vector:
         """A v; held coordinates of `v` pass through."""
@@ -185,6 +243,8 @@ class SpringMatrix(eqx.Module):
             found = term.entry(i, j)
             if found is not None and term.net.n_springs:
                 total = total + term.net.incident_sum(found)
+        for term in self.blocks.cells:
+            total = total + term.entry(i, j)
         for mask in {id(m): m for m in (self.free[i], self.free[j]) if m is not None}.values():
             total = jnp.where(mask, total, jnp.full((), float(i == j), dtype))
         return total
@@ -234,13 +294,12 @@ class SpringMatrix(eqx.Module):
                 rows.append(nodes * dim + i)
                 columns.append(nodes * dim + j)
                 values.append(value)
-                for term in self.blocks.springs:
-                    found = term.entry(i, j)
-                    if found is not None and term.net.n_springs:
+                for term in self.blocks.pairs:
+                    found = term.across(i, j)
+                    if found is not None:
                         tail, head = term.net.edges[:, 0], term.net.edges[:, 1]
-                        off = -np.asarray(term.net.flatten(found))
-                        add(tail, head, i, j, off)
-                        add(head, tail, i, j, off)
+                        add(tail, head, i, j, found)
+                        add(head, tail, j, i, found)
         size = (n * dim, n * dim)
         matrix = coo_array((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=size).tocsr()
         matrix.eliminate_zeros()
@@ -264,4 +323,4 @@ def _embedded(total: Vector, axes: tuple[int, ...], like: Vector) -> Vector:
     return Vector(tuple(total[axes.index(i)] if i in axes else jnp.zeros_like(a) for i, a in enumerate(like)))
 
 
-__all__ = ["Blocks", "NodeDyads", "SpringBlocks", "SpringMatrix", "isotropic"]
+__all__ = ["Blocks", "CellDyads", "NodeDyads", "SpringBlocks", "SpringMatrix", "isotropic"]

@@ -15,7 +15,7 @@ from jaxtyping import Array
 
 from ..topology.edge_field import EdgeField
 from ..vector import Vector
-from .operators import SpringBlocks, SpringMatrix
+from .operators import CellDyads, SpringBlocks, SpringMatrix
 
 
 def spring_blocks(term: SpringBlocks, family: int, dim: int, dtype: jnp.dtype) -> Array:
@@ -33,7 +33,7 @@ def spring_blocks(term: SpringBlocks, family: int, dim: int, dtype: jnp.dtype) -
 
 
 def node_blocks(matrix: SpringMatrix, others: Sequence[SpringBlocks], dtype: jnp.dtype) -> Array:
-    """(D, D, *node shape) every node's block without its springs, but with those of `others`; zero where held."""
+    """(D, D, *node shape) every node's block without its springs, but with those of `others` and its part of each cell; zero where held."""
     dim, shape = matrix.dim, matrix.like.shape
     total = jnp.zeros((dim, dim, *shape), dtype)
     for d in matrix.blocks.diagonal:
@@ -45,6 +45,8 @@ def node_blocks(matrix: SpringMatrix, others: Sequence[SpringBlocks], dtype: jnp
         if term.net.n_springs:
             families = [spring_blocks(term, family, dim, dtype) for family in range(len(term.weight))]
             total = total + _sum_at_nodes(term, families, shape)
+    for cells in matrix.blocks.cells:
+        total = total + _at_corners(cells, shape, dtype)
     free = free_coordinates(matrix, dtype)
     return total if free is None else total * outer(free)
 
@@ -77,6 +79,14 @@ def _sum_at_nodes(term: SpringBlocks, families: list[Array], shape: tuple[int, .
     dim = len(families[0])
     sums = [term.net.incident_sum(EdgeField(tuple(f[i, j] for f in families))) for i in range(dim) for j in range(dim)]
     return jnp.stack(sums).reshape(dim, dim, *shape)
+
+
+def _at_corners(cells: CellDyads, shape: tuple[int, ...], dtype: jnp.dtype) -> Array:
+    """(D, D, *node shape) the blocks of single nodes: what joins the corners of a cell is left out."""
+    resisting = CellDyads(cells.corners, tuple(_clipped(s) for s in cells.slopes), cells.directions)
+    dim = len(cells.directions[0][0]) if cells.directions else 0
+    found = [[resisting.entry(min(i, j), max(i, j)).astype(dtype) for j in range(dim)] for i in range(dim)]
+    return jnp.stack([jnp.stack(row) for row in found]).reshape(dim, dim, *shape)
 
 
 def _clipped(a: Array) -> Array:

@@ -35,7 +35,6 @@ from .assembly import (
     entry_addresses,
     find_places,
     read_entries,
-    spring_terms,
     store_entries,
 )
 from .base import LinearSolver, SolveInfo
@@ -145,7 +144,7 @@ class Skyline(LinearSolver):
         return SkylineMemory(entries, factor)
 
     def _terms(self, matrix: SpringMatrix) -> tuple[SpringPlaces, ...]:
-        return tuple(find_places(self.springs, term) for term in spring_terms(matrix))
+        return tuple(find_places(self.springs, term) for term in matrix.blocks.pairs)
 
 
 class SkylineFactor(eqx.Module):
@@ -189,7 +188,7 @@ def _by_size(skyline: Skyline, classes: tuple[Alike, ...]) -> list[tuple[Panels,
 @eqx.filter_jit
 def _read(skyline: Skyline, matrix: SpringMatrix, classes: tuple[Alike, ...]) -> tuple[Array, ...]:
     """(C, M) entries, for each number of coupled coordinates."""
-    terms = tuple(find_places(skyline.springs, term) for term in spring_terms(matrix))
+    terms = tuple(find_places(skyline.springs, term) for term in matrix.blocks.pairs)
     return tuple(
         jnp.stack([read_entries(matrix, groups[0], skyline.nodes, terms) for groups in alike]) for _, alike in _by_size(skyline, classes)
     )

@@ -100,7 +100,7 @@ class _Kick(eqx.Module):
     def is_diagonal(self) -> bool:
         """Whether no damping couples nodes or coordinates."""
         damping = self.system.damping_blocks(self.state)
-        return not (damping.dyads or damping.springs)
+        return not (damping.dyads or damping.springs or damping.cells)
 
     def matrix(self) -> SpringMatrix:
         """M + dt G."""

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from .._lazy import face as _face
 
 if TYPE_CHECKING:  # written by `python -m tests.face`
+    from ..forces.springs import ExpansionRule as ExpansionRule
     from .backward import HeatIteration as HeatIteration
     from .boundaries import Convection as Convection
     from .boundaries import FixedTemperature as FixedTemperature

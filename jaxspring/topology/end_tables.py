@@ -47,14 +47,14 @@ def tables(pairs: np.ndarray, width: np.ndarray) -> Ends:
     for w in np.unique(width[width > 0]):
         nodes = np.flatnonzero(width == w)
         n_parts = np.maximum(-(-degree[nodes] // WIDEST), 1)
-        done, of = WIDEST * _counted(n_parts), np.repeat(np.arange(len(nodes)), n_parts)
+        done, of = WIDEST * counted(n_parts), np.repeat(np.arange(len(nodes)), n_parts)
         rows = min(int(w), WIDEST)
         slot, real_to = np.arange(rows)[:, None], np.minimum(degree[nodes][of] - done, WIDEST)
         real = slot < real_to
         entries = by_node[start[nodes][of] + done + np.where(real, slot, 0)]
         columns.append((entries.ravel(), real.ravel()))
         classes.append(Class(rows, len(of), first, begin, bool(w > WIDEST)))
-        owners, rounds = (first + of, _rounds(n_parts)) if w > WIDEST else (owners, rounds)
+        owners, rounds = (first + of, rounds_of(n_parts)) if w > WIDEST else (owners, rounds)
         first, begin = first + len(nodes), begin + entries.size
     entries, real = (np.concatenate(column) for column in zip(*columns, strict=True)) if columns else (np.zeros(0, int),) * 2
     places = np.zeros(pairs.size, np.int32)
@@ -88,17 +88,17 @@ def common(degrees: Sequence[np.ndarray]) -> np.ndarray:
     return np.concatenate([widths(need), np.zeros(loners, int)])
 
 
-def _counted(numbers: np.ndarray) -> np.ndarray:
+def counted(numbers: np.ndarray) -> np.ndarray:
     """0, 1, ... n - 1 for each number n, one after the other."""
     return np.arange(numbers.sum()) - np.repeat(np.cumsum(numbers) - numbers, numbers)
 
 
-def _rounds(n_parts: np.ndarray) -> tuple[np.ndarray, ...]:
+def rounds_of(n_parts: np.ndarray) -> tuple[np.ndarray, ...]:
     """Tables that sum so many columns for each hub; missing entries name the zero that follows the last column."""
     rounds = []
     while (n_parts > 1).any():
         n_rows = -(-n_parts // WIDEST)
-        start = np.repeat(np.cumsum(n_parts) - n_parts, n_rows) + WIDEST * _counted(n_rows)
+        start = np.repeat(np.cumsum(n_parts) - n_parts, n_rows) + WIDEST * counted(n_rows)
         at = start + np.arange(min(WIDEST, n_parts.max()))[:, None]
         rounds.append(np.where(at < np.repeat(np.cumsum(n_parts), n_rows), at, n_parts.sum()).astype(np.int32))
         n_parts = n_rows
@@ -122,4 +122,4 @@ def widths(degree: np.ndarray) -> np.ndarray:
     return np.where(degree > WIDEST, WIDEST + 1, of_degree[np.minimum(degree, len(rows) - 1)])
 
 
-__all__ = ["build", "by_class", "common", "tables", "widths"]
+__all__ = ["build", "by_class", "common", "counted", "rounds_of", "tables", "widths"]

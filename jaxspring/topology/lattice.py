@@ -36,6 +36,10 @@ Offset = tuple[int, ...]
 class SpringFamilies:
     """A choice of lattice springs; add choices with `+`.
 
+    A spring of BEND (flexion), of rest length twice the spacing h, stores k h^2 phi^4 / 32 where the row turns by phi: it keeps a sheet
+    from folding, but has no bending stiffness where the row is straight, whatever k is. `js.cloth.AngularJoints` and `js.cloth.Hinges`
+    have one.
+
     >>> (STRUCTURAL + BEND).offsets(2)
     ((0, 1), (1, 0), (0, 2), (2, 0))
     """
@@ -262,7 +266,8 @@ def lattice(
 
     Args:
         shape: nodes along each axis, slowest first, as in `array.shape`.
-        springs: sum of STRUCTURAL, SHEAR (2-D diagonals, 3-D face diagonals), BODY (3-D body diagonals) and BEND (second neighbours).
+        springs: sum of STRUCTURAL, SHEAR (2-D diagonals, 3-D face diagonals), BODY (3-D body diagonals) and BEND (second
+            neighbours, which have no stiffness against a first small bending: see `SpringFamilies`).
         periodic: whether an axis wraps round, for all axes or one each.
         box: (D,) period of each coordinate [m] where an axis wraps; zero where a coordinate does not. Required if any axis wraps.
 

@@ -33,8 +33,8 @@ LAYERS = {
     "thermal": 3,
     "fluid": 3,  # public names of forces
     "plasticity": 3,  # as well
+    "cloth": 7,  # public names of forces, meshes, fabrics, and files of surfaces
     "masses": 4,
-    "cloth": 4,  # what a cloth is made of
     "nodes": 4,
     "bound": 4,
     "system": 4,

@@ -116,7 +116,7 @@ class Given(js.StiffnessRule):
         return jnp.max(self.values)
 
 
-class Grown(js.ExpansionRule):
+class Grown(js.thermal.ExpansionRule):
     """A factor for each spring, in the user's order."""
 
     values: jax.Array

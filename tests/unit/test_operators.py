@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 import jaxspring as js
-from jaxspring.linalg.operators import Blocks, NodeDyads, SpringBlocks, SpringMatrix, isotropic
+from jaxspring.linalg.operators import Blocks, CellDyads, NodeDyads, SpringBlocks, SpringMatrix, isotropic
+from jaxspring.topology.corners import Corners
 
 N = 12
 
@@ -25,10 +26,15 @@ def matrix(request, rng):
     weight, slope, flat = rng.random(net.n_springs), rng.random(net.n_springs), rng.random(net.n_springs)
     free, dyad = rng.random((N, 3)) > 0.2, rng.random(N)
     d = net.difference(state.position)
+    cells = np.array([rng.permutation(N)[:4] for _ in range(5)])
+    slopes, directions = rng.normal(size=(2, 5)), rng.normal(size=(2, 4, 3, 5))
+    vectors = tuple(tuple(js.Vector(tuple(map(jnp.asarray, g))) for g in dyad) for dyad in directions)
+    bent = CellDyads(Corners(cells, net, with_pairs=True), tuple(map(jnp.asarray, slopes)), vectors)
     blocks = Blocks(
         (isotropic(2.0, state.position),),
         (NodeDyads(net.node_field(dyad), state.position),),
         (SpringBlocks(net, net.edge_field(weight), net.edge_field(slope), d), SpringBlocks(net, net.edge_field(flat), axes=(0, 2))),
+        (bent,),
     )
     x = np.asarray(state.points)
     dense = np.zeros((N, 3, N, 3))
@@ -39,6 +45,10 @@ def matrix(request, rng):
         block = weight[e] * np.eye(3) + slope[e] * np.outer(u, u) + flat[e] * np.diag([1.0, 0.0, 1.0])
         for a, b, sign in ((i, i, 1), (j, j, 1), (i, j, -1), (j, i, -1)):
             dense[a, :, b, :] += sign * block
+    for c, corners in enumerate(cells):
+        for s, g in zip(slopes[:, c], directions[..., c], strict=True):
+            for k, l in np.ndindex(4, 4):
+                dense[corners[k], :, corners[l], :] += s * np.outer(g[k], g[l])
     dense = dense.reshape(3 * N, 3 * N)
     held = ~free.ravel()
     dense[held], dense[:, held] = 0, 0

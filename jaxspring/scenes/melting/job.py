@@ -5,8 +5,6 @@ Until the folder is whole there is a checkpoint beside it, from which a later ca
 
 from __future__ import annotations
 
-import json
-import math
 import pathlib
 import time
 from dataclasses import asdict, dataclass
@@ -16,23 +14,18 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from ...archive import read_archive, write_archive
-from ...files import FORM, expect_same, named_arrays, restored
 from ...forces.base import Step
 from ...progress import Progress, Stopwatch
-from ...rollouts import rollout
 from ...state import State
-from ...status import Status
 from ...steppers.explicit import SymplecticEuler
 from ...thermal.fusing import melted_fraction
 from ...thermal.ledger import energy_ledger
 from ..command import FailedError, StoppedError, Written
 from ..drawing import canvas_and_figure
 from ..folder import ResultFolder
+from ..parts import PartedRun
 from .pictures import draw_animation, draw_strip
 from .scene import Melting, MeltSettings, melting_block
-
-FRAMES = 60
 
 
 @dataclass(frozen=True)
@@ -66,75 +59,18 @@ class _Look(eqx.Module):
         return state.time, state.points, state.temperatures, melted_fraction(self.net, state), alive
 
 
-class MeltRun:
-    """A run in parts of equal numbers of frames, which can be kept and taken up.
-
-    Every part starts from the state alone, so that a run that was taken up goes through the very same programs as an unbroken one.
-
-    Attributes:
-        state: where the run is.
-        frames: what was seen until now, the start included.
-        status: of all parts.
-        effects: names for the status.
-    """
+class MeltRun(PartedRun):
+    """A run of the block."""
 
     def __init__(self, scene: Melting, settings: MeltSettings):
         self.scene, self.settings = scene, settings
-        self.n_frames = min(FRAMES, settings.n_steps)
-        self.every = math.ceil(settings.n_steps / FRAMES)
-        self.dt = settings.duration / (self.every * self.n_frames)  # so that equal frames fill the duration
-        self.part = 3 if self.n_frames == FRAMES else 1
-        self.state = scene.system.bind(scene.state.dtype).begin(scene.state)
-        self.status, self.effects = Status.ok(), ()
-        self.frames = jax.tree.map(lambda a: np.asarray(a)[None], _Look(scene.net)(self.state))
-
-    @property
-    def done(self) -> int:
-        """Frames done, besides the start."""
-        return len(self.frames[0]) - 1
-
-    def go_on(self, progress: Progress | None = None, keep: pathlib.Path | None = None) -> None:
-        """To the end, or to the first trouble; what was done is kept in a file after every part."""
-        look, n_steps = _Look(self.scene.net), self.every * self.part
-        while self.done < self.n_frames and bool(self.status.is_ok):
-            part = rollout(self.scene.system, self.state, SymplecticEuler(), self.dt, n_steps, save_every=self.every, observe=look)
-            self.frames = jax.tree.map(lambda a, b: np.concatenate([a, np.asarray(b)]), self.frames, part.saved)
-            self.state, self.status, self.effects = part.state, self.status.then(part.status), part.effects
-            if keep is not None and bool(self.status.is_ok):
-                self._write(keep)
-            if progress is not None:
-                progress.update(self.done, self.n_frames)
+        about = {"kind": "melt", "settings": asdict(settings)}
+        super().__init__(scene.system, scene.state, SymplecticEuler(), settings.n_steps, settings.duration, _Look(scene.net), about)
 
     def seen(self) -> Frames:
         """The frames, ready to be drawn."""
         time, points, temperatures, melted, alive = self.frames
         return Frames(time, points, temperatures, melted, alive, np.asarray(self.scene.net.edges))
-
-    def _write(self, path: pathlib.Path) -> None:
-        arrays = {f"state/{name}": array for name, array in named_arrays(self.state).items()}
-        arrays |= {f"frames/{i}": array for i, array in enumerate(self.frames)}
-        write_archive(path, arrays, self._about())
-
-    def read(self, path: pathlib.Path) -> None:
-        """Take up what an earlier run kept.
-
-        Raises:
-            CheckpointError: the file is damaged, or of other settings.
-            OSError: there is no such file.
-        """
-        archive = read_archive(path)
-        expect_same(path, "problem", archive.about, self._about())
-        arrays = {part: {n.partition("/")[2]: a for n, a in archive.arrays.items() if n.startswith(part)} for part in ("state/", "frames/")}
-        self.state = restored(path, arrays["state/"], self.state)
-        self.frames = tuple(arrays["frames/"][str(i)] for i in range(len(self.frames)))
-
-    def _about(self) -> dict[str, Any]:
-        return {
-            "kind": "melt",
-            "form": FORM,
-            "settings": json.loads(json.dumps(asdict(self.settings))),
-            "dtype": str(self.scene.state.dtype),
-        }
 
 
 def melt(settings: MeltSettings, out: pathlib.Path, progress: Progress | None = None, resume: bool = False) -> Written:

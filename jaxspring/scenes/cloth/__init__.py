@@ -1,0 +1,1 @@
+"""Cloth in measured units: hung, draped, blown, and the tests of a fabric laboratory."""

@@ -1,0 +1,235 @@
+"""Sheets of a fabric: hung by corners, laid over a ball and a table, a flag, and two tests of a fabric laboratory.
+
+    sheet      equilateral triangles, springs and hinges of the fabric's constants                  `fabric`, `rectangle`, `disc`
+    steps      backward Euler: cloth in measured units is stiff in stretch and soft in bending
+    obstacles  `Contact`, with friction; what rests is held inside the implicit solve
+    air        quadratic drag and friction on every triangle                                        `Air`
+
+Gravity acts along -z. Each scene is a function of a `ClothSettings`; `SCENES` names them for the command.
+
+Source: slide "Cloth simulation" names the task; Cusick (1968), "The measurement of fabric drape", for the disc of 15 cm over 9 cm; Peirce
+(1930), "The handle of cloth as a measurable quantity", for the overhanging strip.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..._checks import positive
+from ...cloth.constants import Cloth, fabric
+from ...cloth.materials import INTERLOCK, Material
+from ...cloth.meshes import disc, rectangle
+from ...contact.base import Obstacle
+from ...contact.obstacles import Cylinder, Sphere
+from ...contact.rule import Contact
+from ...forces.air import Air
+from ...forces.loads import Gravity
+from ...state import State
+from ...steppers.base import Stepper
+from ...steppers.implicit import BackwardEuler
+from ...system import System
+from ...topology.mesh_checks import borders
+from ...vector import Vector
+
+GRAVITY = 9.81  # [m/s^2]
+SUPPORT, SPECIMEN = 0.09, 0.15  # radii of Cusick's test [m]
+CHORD = 41.5  # degrees below the horizontal at which the bending test reads its length
+
+
+@dataclass(frozen=True)
+class ClothSettings:
+    """What all scenes share.
+
+    Attributes:
+        material: the fabric: a `Fabric`, `KES`, `FAST`, or a published one.
+        size: side of the sheet [m]; the length of the strip in the bending test. Cusick's disc has its own.
+        spacing: of the nodes [m].
+        duration: simulated time [s].
+        dt: time step [s].
+        wind: speed of the air along x [m/s], for the flag.
+        friction: of cloth on what it lies on.
+    """
+
+    material: Material = INTERLOCK
+    size: float = 0.5
+    spacing: float = 0.02
+    duration: float = 2.0
+    dt: float = 0.01
+    wind: float = 6.0
+    friction: float = 0.4
+
+    def __post_init__(self) -> None:
+        for name in ("size", "spacing", "duration", "dt"):
+            positive(name, np.asarray(getattr(self, name), float), "Give it in metres or seconds.")
+        if self.size < 2 * self.spacing:
+            raise ValueError(f"size = {self.size} is less than two spacings of {self.spacing}; expected more nodes than that.")
+
+
+class ClothScene(eqx.Module):
+    """A sheet, ready to run.
+
+    Attributes:
+        cloth: net, springs, hinges and masses.
+        points: (N, 3) at rest [m].
+        system: with gravity, air and obstacles.
+        state: the start.
+        stepper: for `js.rollout`.
+        obstacle: what it lies on, or None.
+        border: (B,) nodes around the sheet, in order.
+        settings: the numbers (static).
+    """
+
+    cloth: Cloth
+    points: np.ndarray
+    system: System
+    state: State
+    stepper: Stepper
+    obstacle: Obstacle | None
+    border: np.ndarray
+    settings: ClothSettings = eqx.field(static=True)
+
+
+Builder = Callable[[ClothSettings], ClothScene]
+
+
+def hanging(settings: ClothSettings) -> ClothScene:
+    """A sheet that lies level at first, held by the two corners of one side, and swings down."""
+    net, points = rectangle(settings.size, settings.size, settings.spacing)
+    side = points[:, 1] > points[:, 1].max() - 1e-9 * settings.size
+    held = side & ((points[:, 0] <= points[side, 0].min()) | (points[:, 0] >= points[side, 0].max()))
+    return _scene(settings, net, points, held)
+
+
+def on_ball(settings: ClothSettings) -> ClothScene:
+    """A sheet that falls onto a ball of a quarter of its side."""
+    net, points = rectangle(settings.size, settings.size, settings.spacing)
+    radius = settings.size / 4
+    middle = points.mean(axis=0)
+    ball = Sphere((middle[0], middle[1], -radius - 0.01 * settings.size), radius)
+    return _scene(settings, net, points, None, ball)
+
+
+def on_table(settings: ClothSettings) -> ClothScene:
+    """A sheet that falls onto a round table of 0.3 of its side, and hangs over the edge."""
+    net, points = rectangle(settings.size, settings.size, settings.spacing)
+    middle, top = points.mean(axis=0), -0.01 * settings.size
+    ends = [(middle[0], middle[1], top - depth * settings.size) for depth in (0.0, 1.0)]
+    return _scene(settings, net, points, None, Cylinder(*ends, 0.3 * settings.size))
+
+
+def flag(settings: ClothSettings) -> ClothScene:
+    """A sheet held along one side, upright, in wind along x with gusts of a fifth of it."""
+    net, flat = rectangle(settings.size, 0.6 * settings.size, settings.spacing)
+    upright = flat[:, [0, 2, 1]]
+    held = flat[:, 0] < flat[:, 0].min() + 1e-9 * settings.size
+    # What is flat in the wind stays so: a small wave to begin with.
+    wave = 0.01 * settings.size * np.sin(2 * np.pi * flat[:, 0] / settings.size)
+    return _scene(settings, net, flat, held, places=upright + wave[:, None] * [0, 1, 0], wind=_Gusts(jnp.asarray(settings.wind)))
+
+
+def cantilever(settings: ClothSettings) -> ClothScene:
+    """A strip, clamped level at one end: the bending test. Its rows lie across it, about which it bends."""
+    width = max(4 * settings.spacing, settings.size / 8)
+    net, points = rectangle(settings.size + 2 * settings.spacing, width, settings.spacing)
+    clamped = points[:, 0] < 2 * settings.spacing + 1e-9
+    return _scene(settings, net, points, clamped)
+
+
+def cusick(settings: ClothSettings) -> ClothScene:
+    """A disc of 15 cm, held level by one of 9 cm on it: the drape test."""
+    net, points = disc(SPECIMEN, settings.spacing)
+    held = np.hypot(points[:, 0], points[:, 1]) < SUPPORT + 1e-9
+    return _scene(settings, net, points, held)
+
+
+def with_mesh(settings: ClothSettings, net: Any, points: np.ndarray) -> ClothScene:
+    """A flat mesh of the user's, held where it is highest along y, and hanging from there."""
+    held = points[:, 1] > points[:, 1].max() - 0.02 * np.ptp(points[:, 1])
+    return _scene(settings, net, points, held)
+
+
+class _Gusts(eqx.Module):
+    """Wind along x that swells and turns by a fifth."""
+
+    speed: Array
+
+    def __call__(self, places: Vector, time: Array) -> Vector:
+        turn = 2 * jnp.pi * time
+        along = self.speed * (1 + 0.2 * jnp.sin(1.1 * turn)) * jnp.ones_like(places.x)
+        across = 0.2 * self.speed * jnp.sin(1.7 * turn) * jnp.ones_like(places.x)
+        return Vector((along, across, jnp.zeros_like(along)))
+
+
+def _scene(
+    settings: ClothSettings,
+    net: Any,
+    flat: np.ndarray,
+    held: np.ndarray | None,
+    obstacle: Obstacle | None = None,
+    places: np.ndarray | None = None,
+    wind: Any = None,
+) -> ClothScene:
+    cloth = fabric(net, flat, settings.material)
+    air = Air(net, drag=1.2, friction=0.02, wind=wind)
+    forces = (*cloth.forces, air, Gravity((0.0, 0.0, -GRAVITY)))
+    rules = () if obstacle is None else Contact(obstacle, friction=settings.friction)
+    system = System(net, cloth.mass, forces, free=None if held is None else ~held, rules=rules)
+    state = State.from_points(net, flat if places is None else places)
+    border = max(borders(np.asarray(net.triangles)), key=len)
+    return ClothScene(cloth, flat, system, state, BackwardEuler(), obstacle, np.asarray(border), settings)
+
+
+SCENES: dict[str, Builder] = {
+    "hanging": hanging,
+    "ball": on_ball,
+    "table": on_table,
+    "flag": flag,
+    "cantilever": cantilever,
+    "drape": cusick,
+}
+
+
+def drape_coefficient(scene: ClothScene, state: State) -> Array:
+    """Cusick's coefficient: the share of the overhanging ring that is still shadow, (A - pi r^2) / (pi (R^2 - r^2)).
+
+    The shadow is what the border's projection encloses, so that the coefficient has a derivative; where folds reach under one another, it
+    counts the ground between them twice.
+    """
+    x, y = (state.points[scene.border, i] for i in (0, 1))
+    area = 0.5 * jnp.abs(jnp.sum(x * jnp.roll(y, -1) - y * jnp.roll(x, -1)))
+    rest = scene.points[scene.border]
+    # Of the polygon that the disc is, so that what does not drape has 1.
+    whole = 0.5 * abs(np.sum(rest[:, 0] * np.roll(rest[:, 1], -1) - rest[:, 1] * np.roll(rest[:, 0], -1)))
+    support = np.pi * SUPPORT**2
+    return (area - support) / (whole - support)
+
+
+def chord_angle(scene: ClothScene, state: State) -> Array:
+    """How far the chord from the clamp to the free end of a cantilever points below the horizontal [degrees]."""
+    end = scene.points[:, 0] > scene.points[:, 0].max() - 1e-9
+    start = scene.points[:, 0].min() + 2 * scene.settings.spacing
+    tip = jnp.mean(state.points[np.flatnonzero(end)], axis=0)
+    return jnp.degrees(jnp.arctan2(-tip[2], tip[0] - start))
+
+
+__all__ = [
+    "SCENES",
+    "ClothScene",
+    "ClothSettings",
+    "cantilever",
+    "chord_angle",
+    "cusick",
+    "drape_coefficient",
+    "flag",
+    "hanging",
+    "on_ball",
+    "on_table",
+    "with_mesh",
+]

@@ -178,9 +178,9 @@ def provot(
 
 def pair(name: str, value: Numbers) -> tuple[Any, Any]:
     """One number for warp and weft, or one for each."""
-    value = as_inexact(name, value)
-    has_shape(name, value, {"one number": (), "(warp, weft)": (2,)})
-    return (value[0], value[1]) if value.ndim else (value, value)
+    array = as_inexact(name, value)
+    has_shape(name, array, {"one number": (), "(warp, weft)": (2,)})
+    return (array[0], array[1]) if array.ndim else (array, array)
 
 
 def in_space(points: np.ndarray) -> np.ndarray:
@@ -238,20 +238,26 @@ def _filled(border: np.ndarray, spacing: float, middle: np.ndarray) -> tuple[Gra
     keep = _is_inside(places, border) & (away >= CLEAR * spacing)
     points, near = np.concatenate([border, places[keep]]), away[keep] < SMOOTHED * spacing
     moved = len(border) + np.flatnonzero(near)
-    for sweep in range(SWEEPS + 1):
+
+    def inside() -> np.ndarray:
         triangles = Delaunay(points - middle).simplices
-        corners = points[triangles]
-        triangles = triangles[_is_inside(corners.mean(axis=1), border)]
-        if sweep < SWEEPS:
-            sides = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
-            pairs = np.unique(np.sort(sides, axis=1), axis=0)
-            both = np.concatenate([pairs, pairs[:, ::-1]])
-            degree = np.bincount(both[:, 0], minlength=len(points))
-            total = np.stack([np.bincount(both[:, 0], points[both[:, 1], k], len(points)) for k in range(2)], axis=-1)
-            points[moved] = (total / np.maximum(degree, 1)[:, None])[moved]
-    triangles = _counterclockwise(points, triangles)
+        return triangles[_is_inside(points[triangles].mean(axis=1), border)]
+
+    for _ in range(SWEEPS):
+        points[moved] = _middles(inside(), points)[moved]
+    triangles = _counterclockwise(points, inside())
     _check(points, triangles, len(border), spacing)
     return from_triangles(triangles, len(points)), in_space(points)
+
+
+def _middles(triangles: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """(N, 2) the mean of each node's neighbours."""
+    sides = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    pairs = np.unique(np.sort(sides, axis=1), axis=0)
+    both = np.concatenate([pairs, pairs[:, ::-1]])
+    degree = np.bincount(both[:, 0], minlength=len(points))
+    total = np.stack([np.bincount(both[:, 0], points[both[:, 1], k], len(points)) for k in range(2)], axis=-1)
+    return total / np.maximum(degree, 1)[:, None]
 
 
 def _counterclockwise(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:

@@ -34,7 +34,7 @@ from ..topology.corners import Corners
 from ..topology.mesh_checks import Sides, borders, pieces, refuse_crowded, signed_volumes, triangles_of
 from ..vector import Vector
 from .base import Force, Scene, any_not_positive, any_refused
-from .triangles import area_vectors, check_net, check_space, corners_of, cross, perimeters, thirds
+from .triangles import area_vectors, check_space, corners_of, cross, perimeters, thirds
 
 
 class Caps(eqx.Module):
@@ -159,10 +159,6 @@ class Pressure(Force):
         still = cls(net, points, pressure, triangles=triangles, cap_holes=cap_holes)
         places = Vector(tuple(net.node_field(column) for column in on_host("points", points).T))
         return cls(net, points, pressure, still._volume(places), ambient, triangles, cap_holes)
-
-    def check(self, scene: Scene) -> None:
-        """Raise ValueError for another net's nodes."""
-        check_net(self, scene)
 
     def bind(self, scene: Scene) -> Pressure:
         """The same with constants in the dtype of the state."""

@@ -143,7 +143,7 @@ def test_a_level_sheet_falls_at_its_terminal_speed():
 
 
 def test_a_fall_in_air_and_its_derivatives():
-    """v = v_t tanh(g t / v_t) from rest; derivatives of the speed by rho, C_d and an even upward wind in closed form and by differences."""
+    """From rest v = v_t tanh(g t / v_t); derivatives of the speed by rho, C_d and an even upward wind in closed form and by differences."""
     time, n = 0.6, 120
 
     @jax.jit

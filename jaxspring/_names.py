@@ -85,6 +85,17 @@ PUBLIC: dict[str, dict[str, tuple[str, ...]]] = {
         "forces.pressure": ("Pressure",),
         "topology.mesh_checks": ("MeshReport", "examine", "rewound"),
         "export.surfaces": ("save_obj", "save_stl"),
+        "scenes.cloth.scene": (
+            "ClothScene",
+            "ClothSettings",
+            "cantilever",
+            "cusick",
+            "drape_coefficient",
+            "flag",
+            "hanging",
+            "on_ball",
+            "on_table",
+        ),
     },
     "contact": {
         "contact.base": ("Obstacle",),

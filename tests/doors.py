@@ -357,27 +357,29 @@ BY_HAND = {
 
 # What the library makes and hands out; nobody else builds it.
 MADE_INSIDE = """
-    Account Blocks Body BoundSystem CellDyads Cloth Creased Energy Equilibrium Finding Fit GradientCheck History Impulse
-    Iteration Memory MeshReport Modes Moduli NetBatch NodeDyads OdeInfo OdeResult Onset Overlay Profile Reconstructed
-    Result Resume Scene Selection SkylineFactor SolveInfo Solves SpringBlocks SpringMatrix Status Step Surface Torn
-    Undetermined Yielded
+    Account Blocks Body BoundSystem CellDyads Cloth ClothScene Creased Energy Equilibrium Finding Fit GradientCheck
+    History Impulse Iteration Memory MeshReport Modes Moduli NetBatch NodeDyads OdeInfo OdeResult Onset Overlay
+    Profile Reconstructed Result Resume Scene Selection SkylineFactor SolveInfo Solves SpringBlocks SpringMatrix
+    Status Step Surface Torn Undetermined Yielded
 """
 
 # Objects made of options, other objects, functions or files: no array of the user's enters.
 NO_ARRAYS = """
     Adam AllPairs BDF2 BackwardEuler BackwardEulerHeat Bilinear BlockJacobi Bounded CG Cells Channel Checkpoint
-    CheckpointError Checkpointed ConstantsSettings CrankNicolsonHeat CubicSpline Curvature Cutoff EnergyLaw EqualCells
-    ExactSolver ExactTangent ExpansionRule ExplicitHeat Flag Force ForwardEuler GradientMagnitude GradientWarning
-    HalfCells HeatIteration HeatScheme HeightField Hooke Identity ImageError ImplicitMidpoint Impulses Intensity Jacobi
-    JaxCG LBFGS Lattice Law LeastSquares Ledger LinearSolver Linearisation Lineax Luminance Molten Moving Multigrid
-    Natural NeuralController Newton NoCutoff Observation Obstacle Optax Optimiser Ordering PairLaw Pairs Positive
-    PowerLaw Preconditioner Progress Published PullLaw Reconstruction Relaxation ReverseCuthillMcKee Robot RobotSettings
-    Rule RungeKutta4 Sampling Secant SemiImplicit SignedDistance SimulationError Skyline SoftPositive SplitHeat
-    SpringSettings StabilityWarning Stepper StiffnessRule Still Stop StopReason StoreAll StoreStates SymmetricSplitHeat
-    SymplecticEuler Tangent TensionOnly ThermalBoundary Topology Transform Unpreconditioned VelocityVerlet animate batch
-    body_of_cells disc distance domain elevation_model energy_ledger equilibrium fit_constants fit_springs from_mesh
-    gradient_magnitude impulses load load_image melted_fraction normal_modes pad_nets principal_curvatures push_out
-    raise_for_status rectangle save save_trajectory select smoothing_radius stable_dt total_heat train walk
+    CheckpointError Checkpointed ClothSettings ConstantsSettings CrankNicolsonHeat CubicSpline Curvature Cutoff
+    EnergyLaw EqualCells ExactSolver ExactTangent ExpansionRule ExplicitHeat Flag Force ForwardEuler
+    GradientMagnitude GradientWarning HalfCells HeatIteration HeatScheme HeightField Hooke Identity ImageError
+    ImplicitMidpoint Impulses Intensity Jacobi JaxCG LBFGS Lattice Law LeastSquares Ledger LinearSolver
+    Linearisation Lineax Luminance Molten Moving Multigrid Natural NeuralController Newton NoCutoff Observation
+    Obstacle Optax Optimiser Ordering PairLaw Pairs Positive PowerLaw Preconditioner Progress Published PullLaw
+    Reconstruction Relaxation ReverseCuthillMcKee Robot RobotSettings Rule RungeKutta4 Sampling Secant SemiImplicit
+    SignedDistance SimulationError Skyline SoftPositive SplitHeat SpringSettings StabilityWarning Stepper
+    StiffnessRule Still Stop StopReason StoreAll StoreStates SymmetricSplitHeat SymplecticEuler Tangent TensionOnly
+    ThermalBoundary Topology Transform Unpreconditioned VelocityVerlet animate batch body_of_cells cantilever cusick
+    disc distance domain drape_coefficient elevation_model energy_ledger equilibrium fit_constants fit_springs flag
+    from_mesh gradient_magnitude hanging impulses load load_image melted_fraction normal_modes on_ball on_table
+    pad_nets principal_curvatures push_out raise_for_status rectangle save save_trajectory select smoothing_radius
+    stable_dt total_heat train walk
 """
 
 

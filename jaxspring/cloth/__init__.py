@@ -35,5 +35,14 @@ if TYPE_CHECKING:  # written by `python -m tests.face`
     from ..topology.mesh_checks import rewound as rewound
     from ..export.surfaces import save_obj as save_obj
     from ..export.surfaces import save_stl as save_stl
+    from ..scenes.cloth.scene import ClothScene as ClothScene
+    from ..scenes.cloth.scene import ClothSettings as ClothSettings
+    from ..scenes.cloth.scene import cantilever as cantilever
+    from ..scenes.cloth.scene import cusick as cusick
+    from ..scenes.cloth.scene import drape_coefficient as drape_coefficient
+    from ..scenes.cloth.scene import flag as flag
+    from ..scenes.cloth.scene import hanging as hanging
+    from ..scenes.cloth.scene import on_ball as on_ball
+    from ..scenes.cloth.scene import on_table as on_table
 else:
     __all__, __getattr__, __dir__ = _face(__name__)

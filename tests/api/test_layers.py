@@ -33,7 +33,7 @@ LAYERS = {
     "thermal": 3,
     "fluid": 3,  # public names of forces
     "plasticity": 3,  # as well
-    "cloth": 7,  # public names of forces, meshes, fabrics, and files of surfaces
+    "cloth": 8,  # public names of forces, meshes, fabrics, files of surfaces, and scenes
     "masses": 4,
     "nodes": 4,
     "bound": 4,

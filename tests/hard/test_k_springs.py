@@ -489,6 +489,7 @@ def instances():
     field = TWO.edge_field(jnp.ones(1))
     sheet = js.cloth.fabric(*js.cloth.rectangle(1.0, 1.0, 0.5), js.cloth.DENIM)
     ball = js.from_triangles([(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)], 4), np.eye(4, 3, -1)
+    hung = js.cloth.hanging(js.cloth.ClothSettings(size=0.2, spacing=0.1))
     fold = js.cloth.Hinges(js.from_triangles([(0, 1, 2), (1, 0, 3)], 4), 1.0)
     classes = [
         js.thermal.Account(number, number, number, number, number, number),
@@ -648,7 +649,7 @@ def instances():
         *(fold, js.cloth.PlasticHinges(fold.net, 0.5), js.cloth.Creased(number, number, number)),
         *(sheet, sheet.realised, sheet.fabric, js.cloth.DENIM, js.cloth.KES(18.0, 4.0, 0.5, 0.1), js.cloth.FAST(120.0, 2.0, 2.5, 18.0)),
         *(js.cloth.Air(sheet.net, wind=(1.0, 0.0, 0.0)), js.cloth.Pressure(*ball, 1.0), js.cloth.examine(*ball)),
-        *(js.cloth.AngularJoints(js.lattice(3), 1.0), js.linalg.CellDyads(fold.triangles, (), ())),
+        *(hung, hung.settings, js.cloth.AngularJoints(js.lattice(3), 1.0), js.linalg.CellDyads(fold.triangles, (), ())),
         *(robot, robot.settings, robot.controller, js.robot.body_of_cells(("#",), 1.0)),
         *(js.robot.Oscillators([0.1], [0.0], 1.0), js.robot.Actuation(js.robot.Oscillators([0.1], [0.0], 1.0), [0])),
     ]

@@ -185,7 +185,7 @@ class BoundSystem(Nodes):
             return None
         from .contact.resting import Resting
 
-        return Resting.of(self.obstacles, state, origin, span, end, self.free_masks(state.dim))
+        return Resting.of(self.obstacles, state, self.acceleration(state), origin, span, end, self.free_masks(state.dim))
 
     def _step(self, before: State, moved: State, dt: Array, meets: bool) -> Step:
         """What the rules may know of a step; what only obstacles ask for is None where there are none."""

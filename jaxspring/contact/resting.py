@@ -73,12 +73,21 @@ class Resting(eqx.Module):
     held: Held
 
     @staticmethod
-    def of(obstacles: tuple[Rule, ...], state: State, origin: Vector, span: Array, end: Array, free: tuple[Array | None, ...]) -> Resting:
+    def of(
+        obstacles: tuple[Rule, ...],
+        state: State,
+        acceleration: Vector,
+        origin: Vector,
+        span: Array,
+        end: Array,
+        free: tuple[Array | None, ...],
+    ) -> Resting:
         """Who rests in a state.
 
         Args:
             obstacles: of the system.
             state: where the step begins.
+            acceleration: there, without the obstacles, beside which a speed is none [m/s^2].
             origin: the step ends at origin + span y [m], y the velocity that it solves for.
             span: [s].
             end: time there [s].
@@ -92,7 +101,7 @@ class Resting(eqx.Module):
             least = surface.rounding(x)
             base = counted_from(surface.distance(x, state.time), least)
             touch = surface.touch(x, now, base)
-            is_on = (touch.height <= least) & is_slow(touch.speed(v), jnp.zeros_like(base), span, least)
+            is_on = (touch.height <= least) & is_slow(touch.speed(v), acceleration.norm(), span, least)
             normals.append(_free_part(touch.normal, free))
             rates.append(touch.rate)
             speeds.append(_landing(surface, touch, x, origin, span, jnp.broadcast_to(end, now.shape), base))
@@ -102,7 +111,7 @@ class Resting(eqx.Module):
             if touch.drag is not None:
                 drag = drag + is_on.astype(base.dtype) * _free_part(touch.drag, free)
         slip = frame_of(tuple(normals), tuple(rates), tuple(lies)).without(_free_part(v, free) - drag)
-        still = is_slow(slip.norm(), jnp.zeros_like(now), span, sum(rounding[1:], start=rounding[0]))
+        still = is_slow(slip.norm(), acceleration.norm(), span, sum(rounding[1:], start=rounding[0]))
         held = Held(tuple(lies), _any(tuple(grips)) & still)
         return Resting(tuple(normals), tuple(speeds), drag, tuple(s.friction for s in surfaces), free, held)
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import jaxspring as js
+from jaxspring.linalg.operators import Blocks, NodeDyads
 
 N, STEPS = 5, 240
 COLUMN = js.lattice(N)
@@ -20,13 +21,22 @@ STATIC = LENGTH - MASS * G * np.arange(N - 1, 0, -1) / K
 TILT = 0.7
 
 
-class Pull(js.Force):
-    """A constant force on each node."""
+class Guide(js.Force):
+    """A constant force on each node, and springs to the line through the origin, without which a column topples."""
 
     pull: js.Vector
+    across: js.Vector
+    stiffness: jax.Array
 
     def force(self, state):
-        return self.pull
+        return self.pull - (self.stiffness * state.position.dot(self.across)) * self.across
+
+    def energy(self, state):
+        return jnp.sum(0.5 * self.stiffness * state.position.dot(self.across) ** 2 - state.position.dot(self.pull))
+
+    def stiffness_blocks(self, state, linearisation):
+        wide = self.across.map(lambda a: jnp.broadcast_to(a, state.position.shape))
+        return Blocks(dyads=(NodeDyads(jnp.broadcast_to(self.stiffness, state.position.shape), wide),))
 
 
 class Row(NamedTuple):
@@ -37,6 +47,7 @@ class Row(NamedTuple):
     normal: np.ndarray
     down: np.ndarray
     points: np.ndarray
+    guide: float
     load: float
     friction: float
     drag: float
@@ -53,7 +64,7 @@ def row(direction=(0.0, 0.0, 0.0, 0.0), tilt=0.0, slope=0.0, lies=False, load=0.
     down = np.sin(slope) * along - np.cos(slope) * normal
     points = np.arange(N)[:, None] * LENGTH * (along if lies else normal)
     constants = np.array([K, G, 0.0, shift]) + h * direction
-    return Row(constants, direction, normal, down, points, *(np.array(a, float) for a in (load, friction, drag, dt)))
+    return Row(constants, direction, normal, down, points, *(np.array(a, float) for a in (0.0 if lies else 1e3, load, friction, drag, dt)))
 
 
 def ended(constants, scene, stepper):
@@ -61,9 +72,11 @@ def ended(constants, scene, stepper):
     k, g, height, shift = constants
     floor = js.Floor(height * scene.normal, scene.normal, scene.friction)
     pull = jnp.zeros((N, 2)).at[-1].set(scene.load * scene.normal)
-    forces = (js.Springs(COLUMN, k, LENGTH), js.Gravity(g * scene.down), js.Drag(scene.drag), Pull(COLUMN.vector_field(pull, "pull")))
+    across = js.Vector((scene.normal[1], -scene.normal[0]))
+    guide = Guide(COLUMN.vector_field(pull, "pull"), across, scene.guide)
+    forces = (js.Springs(COLUMN, k, LENGTH), js.Gravity(g * scene.down), js.Drag(scene.drag), guide)
     system = js.System(COLUMN, MASS, forces, rules=(floor, js.contact.Impulses()))
-    run = js.rollout(system, js.State.from_points(COLUMN, scene.points + shift * scene.normal), stepper, scene.dt, STEPS)
+    run = js.rollout(system, js.State.from_points(COLUMN, scene.points + shift * scene.normal[None]), stepper, scene.dt, STEPS)
     (given,) = js.contact.impulses(system, run.state)
     return run.state.points, (jnp.stack(given.normal.components, -1), jnp.stack(given.friction.components, -1), run.status.flags)
 

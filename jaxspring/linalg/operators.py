@@ -190,6 +190,9 @@ class SpringMatrix(eqx.Module):
         """The first where a coordinate is free, the second where it is held."""
         entries = zip(self.free, where_free, where_held, strict=True)
         found = Vector(tuple(a if mask is None else jnp.where(mask, a, b) for mask, a, b in entries))
+        if self.taken:
+            # Each coordinate reads all of them: without the barrier XLA computes what gave them anew for each.
+            found = lax.optimization_barrier(found)
         for dyad in self.taken:
             found = found - dyad.direction.dot(found - where_held) * dyad.direction
         return found

@@ -78,9 +78,12 @@ class NewtonStage(Converged):
 
     def residual(self, stage: Stage, y: Vector) -> Vector:
         """M (y - v0) / h - f(x0 + h y, y, t) [N]."""
-        return stage.on_free(self.unbalanced(stage, y), y)
+        return stage.on_free(self.unbalanced(stage, None, y), y)
 
-    def unbalanced(self, stage: Stage, y: Vector) -> Vector:
+    def given(self, stage: Stage) -> None:
+        """Nothing that stays from one solve of a step to the next."""
+
+    def unbalanced(self, stage: Stage, given: None, y: Vector) -> Vector:
         """The same everywhere [N]: where nodes are held, what holds them."""
         return stage.inertia(y) - stage.system.force(stage.reached(y))
 
@@ -91,7 +94,7 @@ class NewtonStage(Converged):
 
     def solve(self, stage: Stage, memory: Any) -> tuple[Vector, SolveInfo, Any]:
         """The stage's velocity with its derivative, how the solve ended, and what the solver carries on."""
-        y, info, memory = self.find(stopped(stage), memory)
+        y, info, memory = self.find(stopped(stage), None, memory)
         return self.derived(stage, y, info), info, memory
 
     def derived(self, stage: Stage, y: Vector, info: SolveInfo) -> Vector:
@@ -100,10 +103,10 @@ class NewtonStage(Converged):
         trust = checkpoint_name(jnp.where(info.status.is_ok, one, jnp.full_like(one, jnp.nan)), SOLUTION)
         return implicitly(NewtonStage(self.adjoint, trust, self.solver, self.options), stage, y)
 
-    def find(self, still: Stage, memory: Any) -> tuple[Vector, SolveInfo, Any]:
+    def find(self, still: Stage, given: None, memory: Any) -> tuple[Vector, SolveInfo, Any]:
         """The stage's velocity without a derivative, how the solve ended, and what the solver carries on."""
         start = still.system.hold(still.predictor.velocity)
-        scale = self.scale(still)
+        scale = self.scale(still, None)
         tolerance = self.options.tolerance or (1e-10 if start.dtype == jnp.float64 else 1e-5)
         goal = tolerance * scale + still.rounding()
         merit = self._merit(still)
@@ -164,7 +167,7 @@ class NewtonStage(Converged):
             return clamped(None)
         _, jacobian = jax.linearize(lambda y: self.residual(stage, y), at.y)
         # Loose far from the solution, tight near it: the number of digits then doubles with every step.
-        loose = jnp.minimum(jnp.asarray(0.1, at.norm.dtype), jnp.sqrt(at.norm / (at.norm + self.scale(stage))))
+        loose = jnp.minimum(jnp.asarray(0.1, at.norm.dtype), jnp.sqrt(at.norm / (at.norm + self.scale(stage, None))))
         precondition = self.solver.preconditioner if isinstance(self.solver, IterativeSolver) else BlockJacobi()
         infinite = jnp.full_like(at.norm, jnp.inf)
         exact = truncated_cg(jacobian, -at.r, matrix.within(precondition.build(matrix)), infinite, loose * at.norm)
@@ -192,7 +195,7 @@ class NewtonStage(Converged):
 
         return potential
 
-    def scale(self, stage: Stage) -> Array:
+    def scale(self, stage: Stage, given: None) -> Array:
         """Size of the forces where free [N], each effect by itself, so that a balance of large forces is not taken for their absence."""
         at = stage.predictor
         sizes = [_norm(stage.system.hold(force.force(at))) for force in stage.system.forces]

@@ -24,8 +24,7 @@ from ..linalg.implicit import SOLUTION
 from ..numerics import stopped
 from ..status import Flag, Status
 from ..vector import Vector
-from .newton import NewtonStage
-from .stage import LinearStage, Stage
+from .stage import Stage
 
 SWEEPS = 8  # each lets go all who pull; few steps need more than two
 
@@ -48,11 +47,11 @@ class Solved(eqx.Module):
     push: Vector | None
 
 
-def solved(problem: LinearStage | NewtonStage, stage: Stage, resting: Any, memory: Any) -> Solved:
+def solved(problem: Any, stage: Stage, resting: Any, memory: Any) -> Solved:
     """The stage's solution, nodes held that rest.
 
     Args:
-        problem: how it is solved.
+        problem: how it is solved: a `LinearStage` or a `NewtonStage`.
         stage: nobody held.
         resting: who rests on what (`contact.resting.Resting`); None where there are no obstacles.
         memory: what the solver carries.
@@ -60,15 +59,16 @@ def solved(problem: LinearStage | NewtonStage, stage: Stage, resting: Any, memor
     if resting is None:
         return Solved(stage, *problem.solve(stage, memory), None)
     still, lying = stopped((stage, resting))
+    given = problem.given(still)
     # Less than this is the error of a solve.
-    least = float(jnp.finfo(stage.h.dtype).eps) ** 0.5 * problem.scale(still)
+    least = float(jnp.finfo(stage.h.dtype).eps) ** 0.5 * problem.scale(still, given)
 
     def sweep(carry: Any) -> Any:
         held, let_go, *_, memory, count = carry
         held = held.without(let_go)
         now = still.resting(*lying.taken(held))
-        y, info, memory = problem.find(now, memory)
-        return held, lying.let_go(held, problem.unbalanced(now, y), least), y, info, memory, count + 1
+        y, info, memory = problem.find(now, given, memory)
+        return held, lying.let_go(held, problem.unbalanced(now, given, y), least), y, info, memory, count + 1
 
     zero = jnp.zeros((), jnp.int32)
     nothing = SolveInfo(jnp.zeros_like(stage.h), zero, Status.ok())
@@ -80,7 +80,7 @@ def solved(problem: LinearStage | NewtonStage, stage: Stage, resting: Any, memor
     held, glued = jax.tree.map(lambda a: checkpoint_name(a, SOLUTION), (held, glued))
     stage = stage.resting(*resting.taken(held))
     y = problem.derived(stage, y, info)
-    push = resting.push(held, glued, problem.unbalanced(stage, y))
+    push = resting.push(held, glued, problem.unbalanced(stage, problem.given(stage), y))
     left = jnp.any(jnp.stack(glued.lies), axis=0)
     node = jnp.argmax(jnp.ravel(left)).astype(jnp.int32)
     status = info.status.then(Status.when(Flag.IMPACTS, jnp.any(left), node=node, count=jnp.sum(left)))

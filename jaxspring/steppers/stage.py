@@ -85,8 +85,12 @@ class Stage(eqx.Module):
 
     def matrix(self, state: State, linearisation: Linearisation) -> SpringMatrix:
         """M/h + G + h K at a state."""
+        return self.matrix_of(self.blocks(state, linearisation))
+
+    def matrix_of(self, blocks: Blocks) -> SpringMatrix:
+        """These blocks as a matrix, identity where held."""
         # Computed once: without the barrier XLA computes every block anew in each loop and preconditioner that reads it.
-        return lax.optimization_barrier(self._of(self.blocks(state, linearisation)))
+        return lax.optimization_barrier(self._of(blocks))
 
     def blocks(self, state: State, linearisation: Linearisation) -> Blocks:
         """M/h + G + h K at a state, no coordinate held."""
@@ -127,15 +131,20 @@ class LinearStage(ImplicitProblem):
 
     def residual(self, stage: Stage, y: Vector) -> Vector:
         """A y - b where free [N]."""
-        return stage.on_free(self.unbalanced(stage, y), y)
+        return stage.on_free(self.unbalanced(stage, self.given(stage), y), y)
 
-    def unbalanced(self, stage: Stage, y: Vector) -> Vector:
+    def given(self, stage: Stage) -> tuple[Blocks, Vector]:
+        """A and b, whoever is held."""
+        return stage.blocks(stage.predictor, self.linearisation), self._right_side(stage)
+
+    def unbalanced(self, stage: Stage, given: tuple[Blocks, Vector], y: Vector) -> Vector:
         """A y - b everywhere [N]: where nodes are held, what holds them."""
-        return stage.blocks(stage.predictor, self.linearisation).product(stage.full(y)) - self._right_side(stage)
+        blocks, right_side = given
+        return blocks.product(stage.full(y)) - right_side
 
-    def scale(self, stage: Stage) -> Array:
+    def scale(self, stage: Stage, given: tuple[Blocks, Vector]) -> Array:
         """Size of the forces [N]."""
-        return norm(self._right_side(stage))
+        return norm(given[1])
 
     def solve_linearised(self, stage: Stage, y: Vector, right_side: Vector) -> Vector:
         """A^-1 right_side."""
@@ -144,13 +153,14 @@ class LinearStage(ImplicitProblem):
 
     def solve(self, stage: Stage, memory: Any) -> tuple[Vector, SolveInfo, Any]:
         """The stage's velocity with its derivative, how the solve ended, and what the solver carries on."""
-        y, info, memory = self.find(stopped(stage), memory)
+        still = stopped(stage)
+        y, info, memory = self.find(still, self.given(still), memory)
         return self.derived(stage, y, info), info, memory
 
-    def find(self, stage: Stage, memory: Any) -> tuple[Vector, SolveInfo, Any]:
+    def find(self, stage: Stage, given: tuple[Blocks, Vector], memory: Any) -> tuple[Vector, SolveInfo, Any]:
         """The same without a derivative."""
-        matrix = stage.matrix(stage.predictor, self.linearisation)
-        right_side = self._right_side(stage)
+        blocks, right_side = given
+        matrix = stage.matrix_of(blocks)
         if stage.system.motion is not None or stage.fixed is not None:
             right_side = right_side - matrix.blocks.product(stage.known)
         zero = Vector.zeros_like(right_side)

@@ -25,7 +25,6 @@ from ..state import State
 from ..vector import Vector
 from .frames import Frame, frame_of
 from .rule import Contact, surface_of
-from .surfaces import Surface, Touch
 
 
 class Held(eqx.Module):
@@ -60,6 +59,7 @@ class Resting(eqx.Module):
         normals: of each obstacle, zero in held coordinates.
         speeds: along each of them, which lead onto the obstacle [m/s].
         drag: velocity of the obstacles along their surfaces [m/s].
+        ends: speeds along the normals, and velocity along the surfaces, where the step ends [m/s]; None where no obstacle moves.
         friction: mu of each obstacle.
         free: per coordinate, where nodes are free (None: all are).
         held: who rests.
@@ -68,6 +68,7 @@ class Resting(eqx.Module):
     normals: tuple[Vector, ...]
     speeds: tuple[Array, ...]
     drag: Vector
+    ends: tuple[tuple[Array, ...], Vector] | None
     friction: tuple[Array, ...]
     free: tuple[Array | None, ...]
     held: Held
@@ -94,9 +95,9 @@ class Resting(eqx.Module):
             free: per coordinate, where nodes are free (None: all are).
         """
         x, v, now = state.position, state.velocity, jnp.broadcast_to(state.time, state.position.shape)
-        normals, rates, speeds, lies, grips, rounding = [], [], [], [], [], []
+        normals, rates, speeds, lies, grips, rounding, ends = [], [], [], [], [], [], []
         surfaces = [surface_of(rule, state) for rule in obstacles if isinstance(rule, (Floor, Contact))]
-        drag = Vector.zeros_like(x)
+        drag = drag_at_end = Vector.zeros_like(x)
         for surface in surfaces:
             least = surface.rounding(x)
             base = counted_from(surface.distance(x, state.time), least)
@@ -104,22 +105,38 @@ class Resting(eqx.Module):
             is_on = (touch.height <= least) & is_slow(touch.speed(v), acceleration.norm(), span, least)
             normals.append(_free_part(touch.normal, free))
             rates.append(touch.rate)
-            speeds.append(_landing(surface, touch, x, origin, span, jnp.broadcast_to(end, now.shape), base))
+            # Where nothing moves, the end of the step is seen from where it begins.
+            stands = origin is x and not surface.obstacle.moves
+            last = touch if stands else surface.touch(origin, jnp.broadcast_to(end, now.shape), base)
+            # What a node is off the obstacle by rounding is dropped, its derivative is kept.
+            speeds.append((lax.stop_gradient(touch.height) - last.height) / span)
+            ends.append(-last.rate)
             lies.append(is_on)
             grips.append(is_on & (surface.friction > 0))
             rounding.append(jnp.broadcast_to(least, now.shape))
-            if touch.drag is not None:
+            if touch.drag is not None and last.drag is not None:
                 drag = drag + is_on.astype(base.dtype) * _free_part(touch.drag, free)
+                drag_at_end = drag_at_end + is_on.astype(base.dtype) * _free_part(last.drag, free)
         slip = frame_of(tuple(normals), tuple(rates), tuple(lies)).without(_free_part(v, free) - drag)
         still = is_slow(slip.norm(), acceleration.norm(), span, sum(rounding[1:], start=rounding[0]))
         held = Held(tuple(lies), _any(tuple(grips)) & still)
-        return Resting(tuple(normals), tuple(speeds), drag, tuple(s.friction for s in surfaces), free, held)
+        at_end = (tuple(ends), drag_at_end) if any(s.obstacle.moves for s in surfaces) else None
+        return Resting(tuple(normals), tuple(speeds), drag, at_end, tuple(s.friction for s in surfaces), free, held)
 
     def taken(self, held: Held) -> tuple[tuple[Vector, ...], Array, Vector]:
         """Directions that are taken from those who slide, of length one or zero; who sticks; the velocity of both along what is taken."""
         frame, sticks = self._frame(held), held.sticks
         slides = (~sticks).astype(self.drag.dtype)
         return tuple(slides * e for e in frame.directions), sticks, frame.carried(self.drag) + (1 - slides) * self.drag
+
+    def ended(self, held: Held, v: Vector) -> Vector:
+        """Velocities at the end of the step, those who are held as fast as what holds them is by then [m/s]."""
+        if self.ends is None:
+            return v
+        speeds, drag = self.ends
+        frame = frame_of(self.normals, tuple(-c for c in speeds), held.lies)
+        stuck = frame.carried(v) + drag
+        return frame.onto(v).map(lambda a, b: jnp.where(held.sticks, b, a), stuck)
 
     def let_go(self, held: Held, force: Vector, least: Array) -> Held:
         """Who pulls, and who slides, if this force [N] holds the nodes; what is below `least` [N] is none."""
@@ -143,13 +160,6 @@ class Resting(eqx.Module):
         """Of a force, what is along each normal, and what is along the surfaces [N]."""
         frame, force = self._frame(held), _free_part(force, self.free)
         return frame.shares(tuple(force.dot(e) for e in frame.directions)), frame.without(force)
-
-
-def _landing(surface: Surface, touch: Touch, x: Vector, origin: Vector, span: Array, end: Array, base: Array) -> Array:
-    """Speed along the normal that ends on the obstacle [m/s]. What a node is off it by rounding is dropped, its derivative is kept."""
-    stands = origin is x and not surface.obstacle.moves
-    height = touch.height if stands else surface.touch(origin, end, base).height
-    return (lax.stop_gradient(touch.height) - height) / span
 
 
 def _free_part(v: Vector, free: tuple[Array | None, ...]) -> Vector:

@@ -174,9 +174,9 @@ class ImplicitStepper(Stepper):
             problem: Any = LinearStage(self.solver, self.stiffness)
         else:
             problem = NewtonStage(self.adjoint, None, self.solver, self.newton)
-        found = solved(problem, stage, self._resting(stage, state, dt), memory.solver)
-        stage, info = found.stage, found.info
-        new = self.finish(state, dt, stage, found.y)
+        resting = self._resting(stage, state, dt)
+        found = solved(problem, stage, resting, memory.solver, self.finish, state, dt)
+        stage, new, info = found.stage, found.state, found.info
         status = _breakdown(stage, new).then(info.status)
         energy = memory.energy
         if energy is not None:

@@ -11,6 +11,7 @@ What the net makes of the hold is in the solve: a column of resting nodes does n
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -18,14 +19,17 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.ad_checkpoint import checkpoint_name
+from jaxtyping import Array
 
 from ..linalg.base import SolveInfo
 from ..linalg.implicit import SOLUTION
 from ..numerics import stopped
+from ..state import State
 from ..status import Flag, Status
 from ..vector import Vector
 from .stage import Stage
 
+Finish = Callable[[State, Array, Stage, Vector], State]
 SWEEPS = 8  # each lets go all who pull; few steps need more than two
 
 
@@ -34,20 +38,20 @@ class Solved(eqx.Module):
 
     Attributes:
         stage: with what was held.
-        y: its velocity, with its derivative.
+        state: the new one, with its derivative.
         info: how the solve ended.
         memory: what the solver carries on.
         push: the force of the obstacles [N]; None where there are none.
     """
 
     stage: Stage
-    y: Vector
+    state: State
     info: SolveInfo
     memory: Any
     push: Vector | None
 
 
-def solved(problem: Any, stage: Stage, resting: Any, memory: Any) -> Solved:
+def solved(problem: Any, stage: Stage, resting: Any, memory: Any, finish: Finish, state: State, dt: Array) -> Solved:
     """The stage's solution, nodes held that rest.
 
     Args:
@@ -55,20 +59,32 @@ def solved(problem: Any, stage: Stage, resting: Any, memory: Any) -> Solved:
         stage: nobody held.
         resting: who rests on what (`contact.resting.Resting`); None where there are no obstacles.
         memory: what the solver carries.
+        finish: (state, dt, stage, y) -> the new state.
+        state: where the step begins.
+        dt: [s].
     """
     if resting is None:
-        return Solved(stage, *problem.solve(stage, memory), None)
-    still, lying = stopped((stage, resting))
+        y, info, memory = problem.solve(stage, memory)
+        return Solved(stage, finish(state, dt, stage, y), info, memory, None)
+    still, lying, *begun = stopped((stage, resting, state, dt))
     given = problem.given(still)
     # Less than this is the error of a solve.
     least = float(jnp.finfo(stage.h.dtype).eps) ** 0.5 * problem.scale(still, given)
+
+    def force(stage: Stage, resting: Any, held: Any, given: Any, y: Vector, state: State, dt: Array) -> Vector:
+        """What holds the nodes [N]: what the equations leave over, and what changes the velocity that they give to that of the obstacle."""
+        over = problem.unbalanced(stage, given, y)
+        if resting.ends is None:
+            return over
+        v = finish(state, dt, stage, y).velocity
+        return over + (stage.system.mass / dt) * (resting.ended(held, v) - v)
 
     def sweep(carry: Any) -> Any:
         held, let_go, *_, memory, count = carry
         held = held.without(let_go)
         now = still.resting(*lying.taken(held))
         y, info, memory = problem.find(now, given, memory)
-        return held, lying.let_go(held, problem.unbalanced(now, given, y), least), y, info, memory, count + 1
+        return held, lying.let_go(held, force(now, lying, held, given, y, *begun), least), y, info, memory, count + 1
 
     zero = jnp.zeros((), jnp.int32)
     nothing = SolveInfo(jnp.zeros_like(stage.h), zero, Status.ok())
@@ -80,11 +96,13 @@ def solved(problem: Any, stage: Stage, resting: Any, memory: Any) -> Solved:
     held, glued = jax.tree.map(lambda a: checkpoint_name(a, SOLUTION), (held, glued))
     stage = stage.resting(*resting.taken(held))
     y = problem.derived(stage, y, info)
-    push = resting.push(held, glued, problem.unbalanced(stage, problem.given(stage), y))
+    push = resting.push(held, glued, force(stage, resting, held, problem.given(stage), y, state, dt))
+    new = finish(state, dt, stage, y)
+    new = new.moved(new.position, resting.ended(held, new.velocity))
     left = jnp.any(jnp.stack(glued.lies), axis=0)
     node = jnp.argmax(jnp.ravel(left)).astype(jnp.int32)
     status = info.status.then(Status.when(Flag.IMPACTS, jnp.any(left), node=node, count=jnp.sum(left)))
-    return Solved(stage, y, SolveInfo(info.residual, info.iterations, status), memory, push)
+    return Solved(stage, new, SolveInfo(info.residual, info.iterations, status), memory, push)
 
 
 __all__ = ["Solved", "solved"]

@@ -9,14 +9,14 @@ import jaxspring as js
 from jaxspring.linalg.cg import CG, JaxCG
 from jaxspring.linalg.multigrid import Multigrid
 from jaxspring.linalg.operators import Blocks, NodeDyads, SpringMatrix
-from jaxspring.linalg.preconditioners import BlockJacobi, Jacobi, Unpreconditioned
+from jaxspring.linalg.preconditioners import BlockJacobi
 
-NET = js.lattice((3, 4), js.STRUCTURAL + js.SHEAR)
+NET = js.lattice((2, 4), js.STRUCTURAL + js.SHEAR)
 POINTS = np.c_[NET.grid(1.0), np.sin(NET.grid(1.0)[:, 0])]
 
 
 def scene(rng, dtype):
-    """A matrix of a system, three of whose nodes are held in a coordinate, with two directions taken at five others."""
+    """A matrix of a system, three of whose nodes are held in a coordinate, with directions taken at the five others."""
     n = NET.n_nodes
     free = np.ones((n, 3), bool)
     free[:3, 0] = False
@@ -25,7 +25,7 @@ def scene(rng, dtype):
     blocks = system.stiffness_blocks(state, js.steppers.Tangent())
     matrix = system.matrix(blocks + Blocks((state.position.map(jnp.ones_like),)), state)
     e = np.zeros((2, n, 3))
-    for i in range(5, 10):
+    for i in range(3, 8):
         q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
         e[:, i] = q[:2] if i % 2 else [q[0], 0 * q[1]]
     directions = tuple(NET.vector_field(jnp.asarray(d, dtype), "direction") for d in e)
@@ -48,8 +48,6 @@ def test_the_matrix_is_projected(rng):
 
 SOLVERS = {
     "JaxCG": JaxCG(tolerance=1e-12),
-    "Jacobi": CG(tolerance=1e-12, preconditioner=Jacobi()),
-    "none": CG(tolerance=1e-12, preconditioner=Unpreconditioned()),
     "multigrid": CG(tolerance=1e-12, preconditioner=Multigrid(NET)),
     "Skyline": js.Skyline(NET),
 }
@@ -57,9 +55,7 @@ SOLVERS = {
 
 @pytest.mark.slow
 def test_every_solver_solves_with_it(rng):
-    """The dense solution, b kept exactly along what is taken, and derivatives by b and by the matrix; in no more iterations than twice
-    those of the same matrix without.
-    """
+    """The dense solution, b kept exactly along what is taken, and derivatives by b and by the matrix."""
     matrix, taken, p = scene(rng, np.float64)
     dense = p @ np.asarray(matrix.to_dense()) @ p + np.eye(len(p)) - p
     b = rng.normal(size=(NET.n_nodes, 3))
@@ -78,8 +74,9 @@ def test_every_solver_solves_with_it(rng):
                 x = solver.solve_in_step(scaled, s * right, None, solver.init(scaled))[0]
                 return sum(jnp.sum(a * jnp.cos(jnp.arange(a.size, dtype=a.dtype).reshape(a.shape))) for a in x)
 
-            slope, difference = jax.jit(jax.grad(total))(1.5), (total(1.5 + 1e-5) - total(1.5 - 1e-5)) / 2e-5
-            assert float(slope) == pytest.approx(float(difference), rel=1e-6), name
+            compiled = jax.jit(jax.value_and_grad(total))
+            (above, _), (below, _) = compiled(1.5 + 1e-5), compiled(1.5 - 1e-5)
+            assert float(compiled(1.5)[1]) == pytest.approx(float(above - below) / 2e-5, rel=1e-6), name
 
 
 @pytest.mark.slow

@@ -89,6 +89,7 @@ def _flown(scene: Passage, path: Path, t: Array) -> Path:
 def _refined(scene: Passage, at: Path, span: Array, pulled: Vector, found: Meeting) -> tuple[Path, Array]:
     """The place and time of an impact, with their derivatives, and whether there is one in the time `span` that was left before."""
     zero, one = jnp.zeros_like(at.left), jnp.ones_like(at.left)
+    hair = float(jnp.finfo(zero.dtype).eps) ** 0.5 * scene.dt
     rounding = pick(found.chosen, scene.rounding)
 
     def nearer(at: tuple[Vector, Vector, Array, Array], _: None) -> tuple[tuple[Vector, Vector, Array, Array], None]:
@@ -99,10 +100,10 @@ def _refined(scene: Passage, at: Path, span: Array, pulled: Vector, found: Meeti
         height = touch.height - lax.stop_gradient(jnp.where(jnp.abs(touch.height) <= rounding, touch.height, zero))
         moves = found.is_hit & ~found.is_still & (speed < 0)
         # The search knows no friction: it may have stopped the node, or all but stopped it, on the way.
-        is_near = jnp.abs(height) <= jnp.abs(speed) * span
-        moves = moves & is_near
-        reaches = reaches & (is_near | (height <= rounding) | found.is_still)
         t = jnp.where(moves, -height / jnp.where(moves, speed, one), zero)
+        is_near = (t <= left + hair) & (t >= -span)
+        reaches = reaches & ((moves & is_near) | (height <= rounding) | found.is_still)
+        t = jnp.where(is_near, t, zero)
         return (x + t * (v + (0.5 * t) * pulled), v + t * pulled, left - t, reaches), None
 
     begin = (at.position, at.velocity, at.left, jnp.ones_like(found.is_hit))

@@ -16,7 +16,7 @@ RADIUS = 0.5
 
 @jax.jit
 def thrown(points, velocities, slope, friction, restitution, dt):
-    """Nodes thrown at a slope and a disc on it: places, velocities, impulses and distances after each step, and whether all went well."""
+    """Nodes thrown at a slope and a disc: places, velocities, impulses and distances after each step, whether all was well, and waited."""
     normal = jnp.stack([jnp.sin(slope), jnp.cos(slope)])
     floor = js.Floor(0 * normal, normal, friction[0], restitution[0])
     disc = js.contact.Contact(js.contact.Sphere(0.3 * normal, RADIUS), friction[1], restitution[1])
@@ -28,7 +28,7 @@ def thrown(points, velocities, slope, friction, restitution, dt):
         return state.points, state.velocities, sizes, jnp.stack([floor.height(state), disc.distance(state)])
 
     run = js.rollout(system, js.State.from_points(NODES, points, velocities), js.VelocityVerlet(), dt, STEPS, save_every=1, observe=look)
-    return run.saved, run.status.is_ok
+    return run.saved, run.status.is_ok, run.status.has(js.Flag.IMPACTS)
 
 
 part = st.floats(0.0, 1.0)
@@ -36,25 +36,31 @@ part = st.floats(0.0, 1.0)
 
 @pytest.mark.slow
 @hypothesis.given(st.integers(0, 2**31), st.floats(-0.6, 0.6), st.tuples(part, part), st.tuples(part, part), st.floats(0.002, 0.03))
-@hypothesis.settings(max_examples=40)
+# In the wedge between both a node is braked short of the disc.
+@hypothesis.example(989821581, 0.5770024065314762, (0.65045927, 0.68844673), (0.38892142, 0.1350965), 0.021195175565459447)
+@hypothesis.example(485126280, -0.5785302949236296, (0.19111027, 0.97553297), (0.10747722, 0.45208878), 0.018239165055794655)
+@hypothesis.settings(max_examples=60)
 def test_no_contact_feeds_energy_in(seed, slope, friction, restitution, dt):
     """A slope and a disc on it, friction 0 to 1, restitution 0 to 1, any dt: no node's energy rises, friction is at most mu times the
-    normal impulse of each obstacle in each step, and nobody is inside by more than rounding.
+    normal impulse of each obstacle in each step (on the disc both to the order of a step), and nobody is inside by 10 micrometres, or
+    by 1 mm where the status says that a node had to wait in the wedge.
     """
     rng = np.random.default_rng(seed)
     points = rng.uniform([-1.5, 1.2], [1.5, 3.0], (N, 2))
     velocities = rng.normal(0, 2.0, (N, 2))
     inputs = (np.array(v, float) for v in (slope, friction, restitution, dt))
-    (x, v, given, distances), is_ok = thrown(points, velocities, *inputs)
+    (x, v, given, distances), is_ok, waited = thrown(points, velocities, *inputs)
     assert bool(is_ok)
     x, v, given = (np.asarray(a) for a in (x, v, given))
     energy = 0.5 * np.sum(v**2, axis=-1) + G * x[..., 1]
     scale = np.abs(energy[0]).max() + 1
     # On the disc the slide of a step is of order 2 in the angle that it turns.
     turned = np.max(np.sum(v**2, axis=-1)) * (dt / RADIUS) ** 2
-    assert np.max(np.diff(energy, axis=0)) <= 1e-12 * scale + 0.02 * turned * scale
-    assert np.max(given[:, :, 1] - np.array(friction)[:, None] * given[:, :, 0]) <= 1e-12 * scale + 1e-3 * turned
-    assert np.min(distances) >= -1e-12
+    assert np.max(np.diff(energy, axis=0)) <= (1e-12 + 1e-3 * turned) * scale
+    over = np.max(given[:, :, 1] - np.array(friction)[:, None] * given[:, :, 0], axis=(0, 2))
+    assert over[0] <= 1e-12 * scale
+    assert over[1] <= 1e-12 * scale + 0.05 * turned
+    assert np.min(distances) >= (-1e-3 if waited else -1e-5)
 
 
 BODIES = js.Graph.from_edges(np.concatenate([[(0, 1), (1, 2), (2, 3), (3, 0), (0, 2), (1, 3)], [(4, 5), (5, 6), (6, 4)]]), 7)

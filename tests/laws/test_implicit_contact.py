@@ -134,7 +134,7 @@ def test_a_column_on_a_floor(name):
         np.testing.assert_allclose(pushed[0] / 0.05, WEIGHT * up, atol=1e-4)
         np.testing.assert_array_equal(pushed[1:], 0)
     np.testing.assert_allclose(found["relieved"][2][0] / 0.05, 0.4 * WEIGHT * ROWS["relieved"].normal, atol=1e-4)
-    time, near = STEPS * 0.005, 0.01 if name == "BackwardEuler" else 2e-5
+    time, near = STEPS * 0.005, 0.01 if name == "BackwardEuler" else 1e-4
     places, _, pushed, _ = found["lifted"]
     way = (places - ROWS["lifted"].points) @ ROWS["lifted"].normal
     np.testing.assert_allclose(way, 0.5 * 0.2 * G * time**2, rtol=near)
@@ -142,7 +142,9 @@ def test_a_column_on_a_floor(name):
     np.testing.assert_allclose(found["sticks"][0], ROWS["sticks"].points, atol=1e-15)
     places, _, pushed, rubbed = found["slides"]
     rate = G * (np.sin(1.02 * CONE) - 0.5 * np.cos(1.02 * CONE))
-    np.testing.assert_allclose((places - ROWS["slides"].points)[:, 0], 0.5 * rate * time**2, rtol=near)
+    # Of order 1, backward Euler is off by a share of the way of half a step's velocity.
+    off = 0.5 * 0.005 * time * 0.5 * G if name == "BackwardEuler" else 0.0
+    np.testing.assert_allclose((places - ROWS["slides"].points)[:, 0], 0.5 * rate * time**2, rtol=near, atol=off)
     np.testing.assert_allclose(np.linalg.norm(rubbed, axis=-1), 0.5 * pushed[:, 1], rtol=1e-9)
     if has_derivative:
         by_k, by_g, by_floor = (found[row_name][1] @ ROWS[row_name].normal for row_name in ("upright", "tilted", "tilted by floor"))

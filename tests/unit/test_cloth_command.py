@@ -57,7 +57,7 @@ def test_bad_settings_are_named(field, value):
 
 def test_the_command_names_what_there_is():
     """The names that `--help` shows are those of the scenes, and each published fabric has one."""
-    assert command.NAMES == tuple(scene.SCENES)
+    assert tuple(scene.SCENES) == command.NAMES
     for name in command.FABRICS:
         assert getattr(js.cloth, name.upper().replace("-", "_")).fabric().density > 0
 

@@ -35,7 +35,7 @@ from .others import environments
 from .others.contest import contest
 from .others.workloads import every
 
-STYLES = {"jaxspring": "o-", "warp": "^--", "newton": "v--", "numba": "x:", "taichi": "s--", "c": "d-."}
+STYLES = {"jaxspring": "C0o-", "warp": "C1^--", "newton": "C2v--", "numba": "C3x:", "taichi": "C4s--", "c": "C5d-."}
 
 
 def so_far() -> dict[str, Any]:

@@ -135,8 +135,15 @@ class BoundSystem(Nodes):
             state = part.keep(state, part.remember(state))
         return state
 
-    def follow(self, before: State, state: State, dt: Array) -> tuple[State, Status]:
-        """What happens after a step besides motion, and what went wrong there."""
+    def follow(self, before: State, state: State, dt: Array, pushed: Vector | None = None) -> tuple[State, Status]:
+        """What happens after a step besides motion, and what went wrong there.
+
+        Args:
+            before: where the step began.
+            state: where motion ended.
+            dt: [s].
+            pushed: change of velocity that obstacles gave in the step already [m/s], or None.
+        """
         total, followers = Status.ok(), self.followers
         obstacles = tuple((i, part) for i, part in followers if part.is_obstacle)
         drivers = tuple((i, part) for i, part in followers if part.drives)
@@ -149,7 +156,7 @@ class BoundSystem(Nodes):
                 stages += [] if isinstance(part, Force) else [(i, state)]
         if obstacles:
             is_kicked = any(part.moves for _, part in followers if not part.is_obstacle)
-            state, status, impacts = _struck(tuple(part for _, part in obstacles), step, state, bool(watchers), is_kicked)
+            state, status, impacts = _struck(self.obstacles, replace(step, pushed=pushed), state, bool(watchers), is_kicked)
             total = total.then(_placed(status, obstacles[0][0]))
             stages.append((-1, state))
         for i, part in drivers:
@@ -161,6 +168,24 @@ class BoundSystem(Nodes):
             state, status = _updated(part, step, state)
             total = total.then(_placed(status, i))
         return state, total
+
+    @property
+    def obstacles(self) -> tuple[Rule, ...]:
+        """What nodes cannot enter."""
+        return tuple(part for _, part in self.followers if part.is_obstacle)
+
+    @property
+    def has_moving_obstacles(self) -> bool:
+        """Whether an obstacle may do work on what rests on it."""
+        return any(getattr(getattr(part, "obstacle", None), "moves", False) for part in self.obstacles)
+
+    def resting(self, state: State, origin: Vector, span: Array, end: Array) -> Any:
+        """What obstacles can take from nodes that rest on them, in a step from a state: see `Resting.of`; None where there are none."""
+        if not self.obstacles:
+            return None
+        from .contact.resting import Resting
+
+        return Resting.of(self.obstacles, state, self.acceleration(state), origin, span, end, self.free_masks(state.dim))
 
     def _step(self, before: State, moved: State, dt: Array, meets: bool) -> Step:
         """What the rules may know of a step; what only obstacles ask for is None where there are none."""

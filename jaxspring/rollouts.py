@@ -303,7 +303,7 @@ def _advance(system: BoundSystem, stepper: Stepper, clock: _Clock, carry: Carry)
     if carry.found is None:
         return Carry(state, memory, index, solves)
     moved = state
-    state, status = system.follow(carry.state, moved, dt)
+    state, status = system.follow(carry.state, moved, dt, stepper.pushed(memory))
     if any(part.moves or part.breaks or part.drives for _, part in system.followers):
         memory = stepper.after_rules(system, carry.state, moved, state, dt, memory)
     status = stopped(eqx.tree_at(lambda s: s.step, status, jnp.where(status.flags != 0, index, status.step)))

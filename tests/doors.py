@@ -306,8 +306,8 @@ DOORS: dict[str, Door] = {
         on_host=("points", "triangles"),
     ),
     "fabric": Door(
-        lambda points: js.cloth.fabric(sheet(), points, js.cloth.DENIM).mass,
-        {"points": np.pad(SQUARE, ((0, 0), (0, 1)))},
+        lambda points: js.cloth.fabric(js.lattice((3, 3), js.STRUCTURAL + js.SHEAR), points, js.cloth.DENIM).mass,
+        {"points": js.lattice((3, 3)).grid(0.5)},
         on_host=("points",),
     ),
     "from_scipy": Door(js.topology.from_scipy, {"matrix": np.array([[0.0, 2.0], [2.0, 0.0]])}, on_host=("matrix",)),

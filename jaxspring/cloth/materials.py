@@ -78,15 +78,13 @@ class Fabric(eqx.Module):
             bending: [N m], one number or (warp, weft).
             coupling: C12 [N/m]; None: not known.
         """
-        self.density = _one("density", density)
-        self.stretch = _two("stretch", stretch)
-        self.shear = _one("shear", shear)
-        self.bending = _two("bending", bending)
-        self.coupling = None if coupling is None else as_inexact("coupling", coupling)
+        given = _one("density", density), _two("stretch", stretch), _one("shear", shear), _two("bending", bending)
+        self.density, self.stretch, self.shear, self.bending = _of_one_type(*given)
+        self.coupling = None if coupling is None else as_inexact("coupling", coupling, self.stretch.dtype)
         if self.coupling is not None:
             has_shape("coupling", self.coupling, {"one number": ()})
             finite("coupling", self.coupling)
-            spare = self.stretch[0] * self.stretch[1] - (self.coupling * self.coupling).astype(self.stretch.dtype)
+            spare = self.stretch[0] * self.stretch[1] - self.coupling * self.coupling
             positive("C11 C22 - coupling^2", spare, "Some stretch would set energy free.")
 
     def fabric(self) -> Fabric:
@@ -104,8 +102,8 @@ class KES(eqx.Module):
         bending: (2,) B [gf cm^2/cm].
 
     >>> wool = KES(weight=18.0, extension=(4.0, 6.0), shear=0.6, bending=(0.1, 0.08))
-    >>> print(wool.fabric().bending, KES.of(wool.fabric()).extension)
-    [9.80665e-06 7.84532e-06] [4. 6.]
+    >>> [f"{1e6 * b:.2f} uN m" for b in wool.fabric().bending], KES.of(wool.fabric()).extension.round(4).tolist()
+    (['9.81 uN m', '7.85 uN m'], [4.0, 6.0])
     """
 
     weight: Array
@@ -114,8 +112,8 @@ class KES(eqx.Module):
     bending: Array
 
     def __init__(self, weight: Numbers, extension: Numbers, shear: Numbers, bending: Numbers):
-        self.weight, self.shear = _one("weight", weight), _one("shear", shear)
-        self.extension, self.bending = _two("extension", extension), _two("bending", bending)
+        given = _one("weight", weight), _two("extension", extension), _one("shear", shear), _two("bending", bending)
+        self.weight, self.extension, self.shear, self.bending = _of_one_type(*given)
 
     def fabric(self) -> Fabric:
         """In SI units."""
@@ -138,8 +136,8 @@ class FAST(eqx.Module):
         bending_length: (2,) c [mm].
 
     >>> shirt = FAST(weight=120.0, extension=(1.5, 3.0), bias=2.4, bending_length=(18.0, 16.0))
-    >>> print((1e6 * shirt.fabric().bending).round(2), shirt.fabric().shear)
-    [6.87 4.82] 51.25
+    >>> [f"{1e6 * b:.2f} uN m" for b in shirt.fabric().bending]
+    ['6.87 uN m', '4.82 uN m']
     """
 
     weight: Array
@@ -148,8 +146,8 @@ class FAST(eqx.Module):
     bending_length: Array
 
     def __init__(self, weight: Numbers, extension: Numbers, bias: Numbers, bending_length: Numbers):
-        self.weight, self.bias = _one("weight", weight), _one("bias", bias)
-        self.extension, self.bending_length = _two("extension", extension), _two("bending_length", bending_length)
+        given = _one("weight", weight), _two("extension", extension), _one("bias", bias), _two("bending_length", bending_length)
+        self.weight, self.extension, self.bias, self.bending_length = _of_one_type(*given)
 
     def fabric(self) -> Fabric:
         """In SI units."""
@@ -222,6 +220,12 @@ def _two(name: str, value: Numbers) -> Array:
     has_shape(name, value, {"one number": (), "(warp, weft)": (2,)})
     positive(name, value, "Every fabric has some.")
     return jnp.broadcast_to(value, (2,))
+
+
+def _of_one_type(*arrays: Array) -> tuple[Array, ...]:
+    """In the widest of their types."""
+    dtype = np.result_type(*(a.dtype for a in arrays))
+    return tuple(a.astype(dtype) for a in arrays)
 
 
 __all__ = ["DENIM", "FAST", "INTERLOCK", "KES", "SWIM_KNIT", "Fabric", "Material", "Published"]

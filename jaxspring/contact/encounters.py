@@ -67,13 +67,15 @@ def _leap(scene: Passage, path: Path, i: Array) -> tuple[Path, Array]:
     t = jnp.where(found.is_hit, found.time, path.left)
     is_any_held = any_lane(jnp.any(jnp.stack([jnp.any(h) for h in path.held])))
     at = lax.cond(is_any_held, lambda: slide(scene, path, t, way, bends), lambda: _flown(scene, path, t))
-    at = _refined(scene, at, way.acceleration, found)
-    after = thrown(scene, at, way.acceleration, found.chosen, found.is_hit, i >= LATE)
+    at, reaches = _refined(scene, at, path.left, way.acceleration, found)
+    is_hit = found.is_hit & reaches
+    after = thrown(scene, at, way.acceleration, found.chosen, is_hit, i >= LATE)
     zero = jnp.zeros_like(path.left)
     after = dataclasses.replace(after, left=jnp.where(i < MOST, after.left, zero))
-    at = dataclasses.replace(at, left=zero)
+    # Whom friction stops short of an obstacle goes on from there.
+    at = dataclasses.replace(at, left=jnp.where(found.is_hit & (i < MOST), at.left, zero))
     # Whose way has ended before stays there.
-    after = jax.tree.map(lambda new, old: jnp.where(found.is_hit, new, old), after, at)
+    after = jax.tree.map(lambda new, old: jnp.where(is_hit, new, old), after, at)
     return jax.tree.map(lambda new, old: jnp.where(path.left > 0, new, old), after, path), found.is_hit
 
 
@@ -84,23 +86,29 @@ def _flown(scene: Passage, path: Path, t: Array) -> Path:
     return dataclasses.replace(path, position=x, velocity=v, arrived=v + scene.offset, left=path.left - t)
 
 
-def _refined(scene: Passage, at: Path, pulled: Vector, found: Meeting) -> Path:
-    """The place and time of an impact, with their derivatives."""
+def _refined(scene: Passage, at: Path, span: Array, pulled: Vector, found: Meeting) -> tuple[Path, Array]:
+    """The place and time of an impact, with their derivatives, and whether there is one in the time `span` that was left before."""
     zero, one = jnp.zeros_like(at.left), jnp.ones_like(at.left)
+    hair = float(jnp.finfo(zero.dtype).eps) ** 0.5 * scene.dt
     rounding = pick(found.chosen, scene.rounding)
 
-    def nearer(at: tuple[Vector, Vector, Array], _: None) -> tuple[tuple[Vector, Vector, Array], None]:
-        x, v, left = at
+    def nearer(at: tuple[Vector, Vector, Array, Array], _: None) -> tuple[tuple[Vector, Vector, Array, Array], None]:
+        x, v, left, reaches = at
         touch = picked(found.chosen, scene.touches(x, scene.start + (scene.dt - left)))
         speed = touch.speed(v)
         # What is rounding counts as on the obstacle: its value is dropped, its derivative is kept.
         height = touch.height - lax.stop_gradient(jnp.where(jnp.abs(touch.height) <= rounding, touch.height, zero))
         moves = found.is_hit & ~found.is_still & (speed < 0)
+        # The search knows no friction: it may have stopped the node, or all but stopped it, on the way.
         t = jnp.where(moves, -height / jnp.where(moves, speed, one), zero)
-        return (x + t * (v + (0.5 * t) * pulled), v + t * pulled, left - t), None
+        is_near = (t <= left + hair) & (t >= -span)
+        reaches = reaches & ((moves & is_near) | (height <= rounding) | found.is_still)
+        t = jnp.where(is_near, t, zero)
+        return (x + t * (v + (0.5 * t) * pulled), v + t * pulled, left - t, reaches), None
 
-    (x, v, left), _ = lax.scan(nearer, (at.position, at.velocity, at.left), None, length=REFINEMENTS)
-    return dataclasses.replace(at, position=x, velocity=v, left=left)
+    begin = (at.position, at.velocity, at.left, jnp.ones_like(found.is_hit))
+    (x, v, left, reaches), _ = lax.scan(nearer, begin, None, length=REFINEMENTS)
+    return dataclasses.replace(at, position=x, velocity=v, left=left), reaches
 
 
 def _next_impact(scene: Passage, path: Path, way: Way, bends: tuple[Array, ...]) -> Meeting:

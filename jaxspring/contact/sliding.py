@@ -53,7 +53,8 @@ def slide(scene: Passage, path: Path, t: Array, way: Way, bends: tuple[Array, ..
     # A constant force of friction over the time t; one that stops the node also ends what the stepper's offset moves it.
     place = path.position + t * (begun + (0.5 * t) * pulled - (0.5 * share) * slip + share * lag)
     landed = _landed(scene, place, frame, end)
-    goes = t > 0
+    # In a shorter time what the surface turns is none, and the rounding of a place over it would be a speed.
+    goes = t > float(jnp.finfo(t.dtype).eps) ** 0.5 * scene.dt
     turned = (landed - place) * jnp.where(goes, 1 / jnp.where(goes, t, jnp.ones_like(t)), jnp.zeros_like(t))
     ended = scene.frame(scene.touches(landed, end), path.held)
     free = y + turned + (0.5 * t) * (a - pulled) + (off - lag)

@@ -38,7 +38,7 @@ from ..topology.base import Topology
 from ..topology.corners import Corners
 from ..vector import Vector
 from .base import Force, Scene, any_refused
-from .triangles import area_vectors, check_net, check_space, corners_of, perimeters, thirds
+from .triangles import area_vectors, check_space, corners_of, perimeters, thirds
 
 Wind = Callable[[Vector, Array], Vector]
 COEFFICIENTS = ("drag", "friction", "lift", "viscous")
@@ -117,10 +117,6 @@ class Air(Force):
             self.wind = as_inexact("wind", wind)
             has_shape("wind", self.wind, {"a velocity": (3,)})
             finite("wind", self.wind)
-
-    def check(self, scene: Scene) -> None:
-        """Raise ValueError for another net's nodes."""
-        check_net(self, scene)
 
     def force(self, state: State) -> Vector:
         """What the air does to each node [N]."""

@@ -56,6 +56,7 @@ class Step(eqx.Module):
         moved: where motion took it, before any rule.
         dt: [s].
         free: per coordinate, where nodes are free (None: all are). None where no obstacle asks, nor a rule that `sees_free`.
+        pushed: change of velocity that obstacles gave in the step already [m/s], which held nodes there; None where no step holds any.
         by_velocity: (velocities) -> accelerations [m/s^2] by the forces that depend on velocity, where motion ended; None where no force
             does, or no obstacle asks.
         stages: what the rules before this one left, in their order: (place, state), all obstacles together as one of place -1.
@@ -67,6 +68,7 @@ class Step(eqx.Module):
     dt: Array
     free: tuple[Array | None, ...] | None = None
     by_velocity: Callable[[Vector], Vector] | None = None
+    pushed: Vector | None = None
     stages: tuple[tuple[int, State], ...] = ()
     impacts: Any = None
 

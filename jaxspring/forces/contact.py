@@ -189,7 +189,10 @@ def _begun(planes: tuple[Plane, ...], step: Step, books: bool) -> tuple[Impacts,
 
 
 def parabola(step: Step) -> tuple[Array, Vector, Vector, Vector, Array]:
-    """dt, u, a, `off` (see `impacts.py`), and the time that each node has [s]: none with dt <= 0, where dt comes back as 1."""
+    """dt, u, a, `off` (see `impacts.py`), and the time that each node has [s]: none with dt <= 0, where dt comes back as 1.
+
+    What obstacles have given in the step already is left out of a: they give it again, where it meets friction and stands in the books.
+    """
     before, moved = step.before, step.moved
     goes = step.dt > 0
     dt = jnp.where(goes, step.dt, jnp.ones_like(step.dt))
@@ -197,7 +200,8 @@ def parabola(step: Step) -> tuple[Array, Vector, Vector, Vector, Array]:
     a = per_dt * (moved.velocity - before.velocity)
     u = per_dt * (moved.position - before.position) - (0.5 * dt) * a
     left = jnp.broadcast_to(jnp.where(goes, step.dt, jnp.zeros_like(step.dt)), moved.position.shape)
-    return dt, u, a, moved.velocity - (u + dt * a), left
+    offset = moved.velocity - (u + dt * a)
+    return dt, u, a if step.pushed is None else a - per_dt * step.pushed, offset, left
 
 
 def changed(state: State, moved: State, position: Vector, velocity: Vector, is_kicked: bool) -> State:

@@ -67,6 +67,8 @@ class PlasticHinges(Rule):
         self.net = net
         self.yield_angle, self.hardening = as_inexact("yield_angle", yield_angle), as_inexact("hardening", hardening)
         for name in ("yield_angle", "hardening"):
+            if getattr(self, name).ndim > 1:
+                raise ValueError(f"{name} has shape {getattr(self, name).shape}; expected () (one number), or (H,) (one per hinge).")
             nonnegative(name, getattr(self, name), "A hinge would yield before it is bent, or ever more easily.")
         self.hinges = None
 

@@ -18,18 +18,11 @@ from ..topology.base import Topology
 from ..topology.corners import Corners
 from ..topology.mesh_checks import triangles_of
 from ..vector import Vector
-from .base import Scene
 
 
 def corners_of(net: Topology, triangles: Numbers | Corners | None) -> Corners:
     """The corners of triangles: as given, of (T, 3) node numbers, or of the net's own."""
     return triangles if isinstance(triangles, Corners) else Corners(triangles_of(net, triangles), net)
-
-
-def check_net(part: Any, scene: Scene) -> None:
-    """Raise ValueError where a part was built with a net over other nodes than the system's."""
-    if part.net.layout != scene.net.layout:
-        raise ValueError(f"{type(part).__name__} was built with a net over other nodes than the system's. Build it with the system's net.")
 
 
 def check_space(part: Any, state: State) -> None:
@@ -61,4 +54,4 @@ def thirds(corners: Corners, values: Any) -> Any:
     return corners.sum((third, third, third))
 
 
-__all__ = ["area_vectors", "check_net", "check_space", "corners_of", "cross", "perimeters", "thirds"]
+__all__ = ["area_vectors", "check_space", "corners_of", "cross", "perimeters", "thirds"]

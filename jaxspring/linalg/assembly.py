@@ -81,7 +81,7 @@ def alike_coordinates(matrix: SpringMatrix) -> tuple[Alike, ...]:
 def _couplings(matrix: SpringMatrix) -> list[Group]:
     everything = tuple(range(matrix.dim))
     springs = [term.axes or everything for term in matrix.blocks.springs if term.slope is not None]
-    return springs + [everything for _ in (*matrix.blocks.dyads, *matrix.blocks.cells)]
+    return springs + [everything for _ in (*matrix.blocks.dyads, *matrix.blocks.cells, *matrix.taken)]
 
 
 def _signature(matrix: SpringMatrix, i: int) -> tuple:

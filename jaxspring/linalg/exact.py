@@ -55,7 +55,8 @@ class ExactSolver(eqx.Module):
         Raises:
             TypeError: J is not symmetric, and only conjugate gradients were allowed.
         """
-        precondition = self.cg.preconditioner.build(lax.stop_gradient(nearby))
+        nearby = lax.stop_gradient(nearby)
+        precondition = nearby.within(self.cg.preconditioner.build(nearby))
         if is_symmetric:
             return self.cg.solve(jacobian, b, precondition)[0]
         if not self.allow_nonsymmetric:

@@ -115,7 +115,8 @@ class IterativeSolver(LinearSolver):
         """Solve with a `SpringMatrix`; held coordinates of x are those of b, exactly, and take no part in the iteration."""
         zero = Vector.zeros_like(b)
         start = None if guess is None else matrix.pick(guess, zero)
-        precondition = self.preconditioner.build(stopped(matrix))
+        still = stopped(matrix)
+        precondition = still.within(self.preconditioner.build(still))
         x, info = self.solve(matrix, matrix.pick(b, zero), precondition, start)
         return matrix.pick(x, b), info, memory
 
@@ -124,7 +125,8 @@ class IterativeSolver(LinearSolver):
         matrix, b, guess = stopped((matrix, b, guess))
         zero = Vector.zeros_like(b)
         start = None if guess is None else matrix.pick(guess, zero)
-        x, info = self._guarded(matrix, matrix.pick(b, zero), start, self.preconditioner.build(matrix), self._goal(b))
+        precondition = matrix.within(self.preconditioner.build(matrix))
+        x, info = self._guarded(matrix, matrix.pick(b, zero), start, precondition, self._goal(b))
         return matrix.pick(x, b), info, memory
 
     def _goal(self, b: PyTree) -> float:

@@ -5,12 +5,16 @@
 `D` takes differences along springs, `u` is a spring's direction, `g` a node's, or that of all corners of a cell. `M/dt + G + dt K` has
 this form: a spring gives its weight w and slope s (see `forces/laws.py`), a dashpot a slope alone, masses and drag a diagonal, bending a
 slope for the corners of a hinge. A coordinate that is held has an identity row and column: a product and a solve leave it alone, exactly.
+So has a direction e that is taken from a node: with P the product of all (I - e e'), the matrix is P A P + I - P. Direct solvers and
+preconditioners see A + F e e' instead, F large: close to it.
 
 Source: slide "Implicit Solution"; blocks as in Baraff and Witkin (1998), section 4.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -204,12 +208,15 @@ class SpringMatrix(eqx.Module):
         free: per coordinate, a bool array in node shape (None: all free).
         like: a `Vector` in node shape that tells shape, dimension and dtype.
         layout: how node fields are stored (static).
+        taken: directions that are held, of length one or zero, at right angles to each other at every node; their slopes stand for
+            firmness where a matrix must be factored.
     """
 
     blocks: Blocks
     free: tuple[Array | None, ...]
     like: Vector
     layout: NodeLayout = eqx.field(static=True)
+    taken: tuple[NodeDyads, ...] = ()
 
     @property
     def dim(self) -> int:
@@ -219,7 +226,20 @@ class SpringMatrix(eqx.Module):
     @property
     def is_scalar(self) -> bool:
         """Whether the coordinates decouple by construction: no spring or node block has an entry off its diagonal."""
-        return not (self.blocks.dyads or self.blocks.cells) and all(term.slope is None for term in self.blocks.springs)
+        return not (self.blocks.dyads or self.blocks.cells or self.taken) and all(term.slope is None for term in self.blocks.springs)
+
+    def taking(self, directions: tuple[Vector, ...]) -> SpringMatrix:
+        """The same with these directions held: of length one or zero, at right angles, zero in coordinates that are held already."""
+        own = self.diagonal()
+        # Far above what a node has of its own, and far below where that would be lost beside it.
+        firm = float(jnp.finfo(self.like.dtype).eps) ** -0.4 * sum(own.map(jnp.abs))
+        return replace(self, taken=tuple(NodeDyads(firm, e) for e in directions))
+
+    def within(self, inverse: Callable[[Vector], Vector]) -> Callable[[Vector], Vector]:
+        """A map r -> about A^-1 r that leaves alone what is taken."""
+        if not self.taken:
+            return inverse
+        return lambda r: self.pick(inverse(self.pick(r, Vector.zeros_like(r))), r)
 
     def __call__(self, v: Vector) -> Vector:
         """A v; held coordinates of `v` pass through."""
@@ -228,7 +248,13 @@ class SpringMatrix(eqx.Module):
     def pick(self, where_free: Vector, where_held: Vector) -> Vector:
         """The first where a coordinate is free, the second where it is held."""
         entries = zip(self.free, where_free, where_held, strict=True)
-        return Vector(tuple(a if mask is None else jnp.where(mask, a, b) for mask, a, b in entries))
+        found = Vector(tuple(a if mask is None else jnp.where(mask, a, b) for mask, a, b in entries))
+        if self.taken:
+            # Each coordinate reads all of them: without the barrier XLA computes what gave them anew for each.
+            found = lax.optimization_barrier(found)
+        for dyad in self.taken:
+            found = found - dyad.direction.dot(found - where_held) * dyad.direction
+        return found
 
     def entry(self, i: int, j: int) -> Array:
         """Entry (i, j) of every node's own D x D block, in node shape."""
@@ -237,7 +263,7 @@ class SpringMatrix(eqx.Module):
         if i == j:
             for d in self.blocks.diagonal:
                 total = total + d[i]
-        for dyad in self.blocks.dyads:
+        for dyad in (*self.blocks.dyads, *self.taken):
             total = total + dyad.slope * dyad.direction[i] * dyad.direction[j]
         for term in self.blocks.springs:
             found = term.entry(i, j)
@@ -271,8 +297,10 @@ class SpringMatrix(eqx.Module):
 
     def to_scipy(self) -> Any:
         """`scipy.sparse.csr_array` in the order of `to_dense`. On the host: not for traced values."""
-        from scipy.sparse import coo_array
+        from scipy.sparse import coo_array, csr_array
 
+        if self.taken:
+            return csr_array(np.asarray(self.to_dense()))
         layout, n, dim = self.layout, int(np.prod(self.like.shape)), self.dim
         free = np.ones((n, dim), bool)
         for i, mask in enumerate(self.free):

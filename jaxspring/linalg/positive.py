@@ -38,7 +38,7 @@ def node_blocks(matrix: SpringMatrix, others: Sequence[SpringBlocks], dtype: jnp
     total = jnp.zeros((dim, dim, *shape), dtype)
     for d in matrix.blocks.diagonal:
         total = total + on_diagonal(jnp.stack([jnp.broadcast_to(_clipped(a), shape).astype(dtype) for a in d]))
-    for dyad in matrix.blocks.dyads:
+    for dyad in (*matrix.blocks.dyads, *matrix.taken):
         direction = jnp.stack([a.astype(dtype) for a in dyad.direction])
         total = total + _clipped(dyad.slope).astype(dtype)[None, None] * outer(direction)
     for term in others:

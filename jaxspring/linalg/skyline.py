@@ -44,6 +44,9 @@ from .operators import SpringMatrix
 from .ordering import Given, Natural, Ordering, ReverseCuthillMcKee, smallest_profile
 from .panels import factor_panels, solve_panels
 
+# Corrections where directions are taken, of which the factor knows all but the share eps^0.4.
+_FOR_TAKEN = 2
+
 
 class Skyline(LinearSolver):
     """Direct solver: factors a positive definite matrix on its envelope, and keeps the factor while the matrix stands.
@@ -112,7 +115,7 @@ class Skyline(LinearSolver):
         The status is PIVOT with the node, NONFINITE, or SOLVER where rounding left a residual above the square root of the precision.
         """
         memory = self.init(matrix) if memory is None else self._renewed(matrix, memory)
-        solve: Callable = partial(_guarded, memory.factor)
+        solve: Callable = partial(_guarded, memory.factor, stopped(matrix))
         x, info = lax.custom_linear_solve(matrix, matrix.pick(b, Vector.zeros_like(b)), solve, symmetric=True, has_aux=True)
         return matrix.pick(x, b), info, memory
 
@@ -122,7 +125,7 @@ class Skyline(LinearSolver):
         """As `solve_in_step`, without a derivative."""
         matrix, b = stopped((matrix, b))
         memory = self.init(matrix) if memory is None else self._renewed(matrix, memory)
-        x, info = _guarded(memory.factor, matrix, matrix.pick(b, Vector.zeros_like(b)))
+        x, info = _guarded(memory.factor, matrix, matrix, matrix.pick(b, Vector.zeros_like(b)))
         return matrix.pick(x, b), info, memory
 
     def _renewed(self, matrix: SpringMatrix, memory: SkylineMemory) -> SkylineMemory:
@@ -234,24 +237,26 @@ def _solved(factor: SkylineFactor, b: Vector) -> Vector:
     return Vector(tuple(jnp.where(factor.status.is_ok, a, nan) for a in found))
 
 
-def _guarded(factor: SkylineFactor, operator: Callable[[Vector], Vector], b: Vector) -> tuple[Vector, SolveInfo]:
+def _guarded(factor: SkylineFactor, matrix: SpringMatrix, operator: Callable[[Vector], Vector], b: Vector) -> tuple[Vector, SolveInfo]:
     """Solve, correct by the residual where that pays, and look at what is left."""
     size = norm(b)
     is_zero = size == 0
     scale = jnp.maximum(size, jnp.finfo(size.dtype).tiny)
     unit = b / scale
-    x = factor.solve(unit)
+    solve = matrix.within(factor.solve)
+    x = solve(unit)
     left = unit - operator(x)
-    # In float32 a correction takes most of the error of the solution for one more solve; in float64 there is little left to take.
-    is_corrected = unit.dtype == jnp.float32
-    if is_corrected:
-        x = x + factor.solve(left)
+    # In float32 a correction takes most of the error of the solution for one more solve; in float64 there is little left to take, but
+    # where directions are taken: each correction then takes all but the share eps^0.4 of it.
+    n_corrections = _FOR_TAKEN if matrix.taken else int(unit.dtype == jnp.float32)
+    for _ in range(n_corrections):
+        x = x + solve(left)
         left = unit - operator(x)
     residual = norm(left)
     status = factor.status.then(Status.when(Flag.NONFINITE, factor.status.is_ok & ~jnp.isfinite(residual)))
     tolerance = jnp.sqrt(jnp.finfo(residual.dtype).eps)
     status = status.then(Status.when(Flag.SOLVER, status.is_ok & ~(residual <= tolerance)))
-    return x * scale, SolveInfo(jnp.where(is_zero, jnp.zeros_like(residual), residual), jnp.asarray(int(is_corrected), jnp.int32), status)
+    return x * scale, SolveInfo(jnp.where(is_zero, jnp.zeros_like(residual), residual), jnp.asarray(n_corrections, jnp.int32), status)
 
 
 def _over_lanes(function: Callable[..., Any], *arrays: Array) -> Any:

@@ -12,6 +12,7 @@ from ..bound import BoundSystem
 from ..forces.base import Force
 from ..linalg.base import SolveInfo
 from ..state import State
+from ..vector import Vector
 
 
 class Stepper(eqx.Module):
@@ -42,6 +43,12 @@ class Stepper(eqx.Module):
 
     def report(self, memory: Any) -> SolveInfo | None:
         """How the linear or nonlinear solve of the last step ended; None for a stepper that solves nothing."""
+        return None
+
+    def pushed(self, memory: Any) -> Vector | None:
+        """Change of velocity that obstacles gave to nodes in the last step already [m/s], since the step held them there: what their rule
+        then books and takes friction by. None for a stepper that knows of no obstacles.
+        """
         return None
 
     def lags_damping(self, effect: Force, state: State) -> bool:

@@ -4,7 +4,8 @@
     ImplicitMidpoint     v* at x* = x + dt/2 v*;   x' = x + dt v*,  v' = 2 v* - v                 order 2, keeps energy of linear systems
     BDF2                 v' at x' = (4 x - x_1 + 2 dt v') / 3, from (4 v - v_1) / 3               order 2, damps stiff motions
 
-where v at x means M (v - v0) / h = f(x, v). Each is one stage (`stage.py`): a linear solve with M/h + G + h K, or Newton's method.
+where v at x means M (v - v0) / h = f(x, v). Each is one stage (`stage.py`): a linear solve with M/h + G + h K, or Newton's method. What
+rests on an obstacle is held inside the solve (`resting.py`).
 
 What enters: springs (K, the tangent clamped positive semi-definite), data springs (K), drag, dashpots and Rayleigh damping (G). What is
 taken at the old time: the change of a stiffness that follows an image, the slope of an image under `ImageAttraction`, the turning of a
@@ -36,6 +37,7 @@ from ..vector import Vector
 from .base import Stepper
 from .energy_watch import EnergyWatch
 from .newton import Newton, NewtonStage
+from .resting import solved
 from .stage import LinearStage, Stage, known_velocities
 
 # Stands for a dt of zero [s].
@@ -50,12 +52,14 @@ class Memory(eqx.Module):
         info: how the last solve ended.
         history: earlier states, where the method needs them.
         energy: what the energy did so far, where nothing can feed energy in; else None.
+        pushed: change of velocity by obstacles that held nodes in the last step [m/s]; None where there are none.
     """
 
     solver: Any
     info: SolveInfo
     history: Any
     energy: EnergyWatch | None
+    pushed: Vector | None = None
 
 
 class ImplicitStepper(Stepper):
@@ -116,6 +120,10 @@ class ImplicitStepper(Stepper):
     def finish(self, state: State, dt: Array, stage: Stage, y: Vector) -> State:
         """The new state from the stage's velocity."""
 
+    def ends(self, stage: Stage, state: State, dt: Array) -> tuple[Vector, Array]:
+        """Origin [m] and time [s]: the step ends at origin + time y."""
+        return stage.origin, stage.h
+
     def remember(self, state: State) -> Any:
         """What of the state before a step the next one needs."""
         return None
@@ -136,9 +144,12 @@ class ImplicitStepper(Stepper):
         dt = jnp.ones((), state.dtype)
         history = self.first_history(state)
         stage = self.stage(system, state, dt, history)
+        resting, pushed = self._resting(stage, state, dt), None
+        if resting is not None:
+            stage, pushed = stage.resting(*resting.taken(resting.held)), Vector.zeros_like(state.velocity)
         carried = self.solver.init(stage.matrix(state, self.stiffness))
         nothing = SolveInfo(jnp.zeros((), state.dtype), jnp.zeros((), jnp.int32), Status.ok())
-        return Memory(carried, nothing, history, EnergyWatch.of(system, state))
+        return Memory(carried, nothing, history, EnergyWatch.of(system, state), pushed)
 
     @property
     def runs_backward(self) -> bool:
@@ -151,6 +162,8 @@ class ImplicitStepper(Stepper):
         # In so short a step masses outweigh all else: what is computed in vain never fails.
         new, after = self._step(system, state, jnp.where(stands, jnp.asarray(_SHORT, dt.dtype), dt), memory)
         after = eqx.tree_at(lambda m: m.info.status, after, after.info.status.only_if(~stands))
+        if after.pushed is not None:
+            after = eqx.tree_at(lambda m: m.pushed, after, after.pushed.map(lambda a: jnp.where(stands, jnp.zeros_like(a), a)))
         dx, dv = grown(_rates, (system, state), dt, (state.position, state.velocity))
         old = state.moved(state.position + dx, state.velocity + dv, new.time)
         return jax.tree.map(lambda old, moved: jnp.where(stands, old, moved), old, new), after
@@ -161,8 +174,9 @@ class ImplicitStepper(Stepper):
             problem: Any = LinearStage(self.solver, self.stiffness)
         else:
             problem = NewtonStage(self.adjoint, None, self.solver, self.newton)
-        y, info, carried = problem.solve(stage, memory.solver)
-        new = self.finish(state, dt, stage, y)
+        resting = self._resting(stage, state, dt)
+        found = solved(problem, stage, resting, memory.solver, self.finish, state, dt)
+        stage, new, info = found.stage, found.state, found.info
         status = _breakdown(stage, new).then(info.status)
         energy = memory.energy
         if energy is not None:
@@ -170,11 +184,20 @@ class ImplicitStepper(Stepper):
             energy = energy.shifted(system, state) if system.rules else energy
             energy = energy.after(stage, new, info.residual)
             status = status.then(Status.when(Flag.ENERGY_ROSE, energy.rose(self.energy_slack(state.dtype))))
-        return new, Memory(carried, SolveInfo(info.residual, info.iterations, status), self.remember(state), energy)
+        pushed = None if found.push is None else (dt / system.mass) * found.push
+        return new, Memory(found.memory, SolveInfo(info.residual, info.iterations, status), self.remember(state), energy, pushed)
+
+    def _resting(self, stage: Stage, state: State, dt: Array) -> Any:
+        """What rests on obstacles where the step begins; None where there are none."""
+        return stage.system.resting(state, *self.ends(stage, state, dt), state.time + dt)
 
     def report(self, memory: Memory) -> SolveInfo:
         """How the last solve ended."""
         return memory.info
+
+    def pushed(self, memory: Memory) -> Vector | None:
+        """Of the nodes that the last solve held."""
+        return memory.pushed
 
 
 class BackwardEuler(ImplicitStepper):
@@ -217,6 +240,10 @@ class ImplicitMidpoint(ImplicitStepper):
         """x + dt v*, 2 v* - v."""
         middle = stage.full(y)
         return state.moved(state.position + dt * middle, stage.system.hold(2 * middle - state.velocity), state.time + dt)
+
+    def ends(self, stage: Stage, state: State, dt: Array) -> tuple[Vector, Array]:
+        """x and dt."""
+        return state.position, dt
 
     def energy_slack(self, dtype: DTypeLike) -> float:
         """A fifth: the rule keeps a nearby energy, about which the true one swings."""

@@ -78,7 +78,14 @@ class NewtonStage(Converged):
 
     def residual(self, stage: Stage, y: Vector) -> Vector:
         """M (y - v0) / h - f(x0 + h y, y, t) [N]."""
-        return stage.on_free(stage.inertia(y) - stage.system.force(stage.reached(y)), y)
+        return stage.on_free(self.unbalanced(stage, None, y), y)
+
+    def given(self, stage: Stage) -> None:
+        """Nothing that stays from one solve of a step to the next."""
+
+    def unbalanced(self, stage: Stage, given: None, y: Vector) -> Vector:
+        """The same everywhere [N]: where nodes are held, what holds them."""
+        return stage.inertia(y) - stage.system.force(stage.reached(y))
 
     def nearby(self, stage: Stage, y: Vector) -> tuple[SpringMatrix, bool]:
         """The clamped matrix."""
@@ -87,9 +94,19 @@ class NewtonStage(Converged):
 
     def solve(self, stage: Stage, memory: Any) -> tuple[Vector, SolveInfo, Any]:
         """The stage's velocity with its derivative, how the solve ended, and what the solver carries on."""
-        still = eqx.combine(lax.stop_gradient(eqx.filter(stage, eqx.is_inexact_array)), stage)
+        y, info, memory = self.find(stopped(stage), None, memory)
+        return self.derived(stage, y, info), info, memory
+
+    def derived(self, stage: Stage, y: Vector, info: SolveInfo) -> Vector:
+        """A solution that `find` gave, with its derivative: NaN where it did not converge."""
+        one = jnp.ones_like(info.residual)
+        trust = checkpoint_name(jnp.where(info.status.is_ok, one, jnp.full_like(one, jnp.nan)), SOLUTION)
+        return implicitly(NewtonStage(self.adjoint, trust, self.solver, self.options), stage, y)
+
+    def find(self, still: Stage, given: None, memory: Any) -> tuple[Vector, SolveInfo, Any]:
+        """The stage's velocity without a derivative, how the solve ended, and what the solver carries on."""
         start = still.system.hold(still.predictor.velocity)
-        scale = self._scale(still)
+        scale = self.scale(still, None)
         tolerance = self.options.tolerance or (1e-10 if start.dtype == jnp.float64 else 1e-5)
         goal = tolerance * scale + still.rounding()
         merit = self._merit(still)
@@ -106,9 +123,7 @@ class NewtonStage(Converged):
         failed = end.status.then(Status.when(Flag.SOLVER, ~converged))
         status = jax.tree.map(lambda ok, bad: jnp.where(converged, ok, bad), Status.ok(), failed)
         relative = end.norm / jnp.where(scale > 0, scale, jnp.ones_like(scale))
-        trust = checkpoint_name(jnp.where(converged, jnp.ones_like(scale), jnp.full_like(scale, jnp.nan)), SOLUTION)
-        problem = NewtonStage(self.adjoint, trust, self.solver, self.options)
-        return implicitly(problem, stage, end.y), SolveInfo(relative, end.iterations, status), end.memory
+        return end.y, SolveInfo(relative, end.iterations, status), end.memory
 
     def _iterate(self, stage: Stage, merit: Any, at: _Progress) -> _Progress:
         direction, iterations, failed, memory = self._direction(stage, at)
@@ -152,10 +167,10 @@ class NewtonStage(Converged):
             return clamped(None)
         _, jacobian = jax.linearize(lambda y: self.residual(stage, y), at.y)
         # Loose far from the solution, tight near it: the number of digits then doubles with every step.
-        loose = jnp.minimum(jnp.asarray(0.1, at.norm.dtype), jnp.sqrt(at.norm / (at.norm + self._scale(stage))))
+        loose = jnp.minimum(jnp.asarray(0.1, at.norm.dtype), jnp.sqrt(at.norm / (at.norm + self.scale(stage, None))))
         precondition = self.solver.preconditioner if isinstance(self.solver, IterativeSolver) else BlockJacobi()
         infinite = jnp.full_like(at.norm, jnp.inf)
-        exact = truncated_cg(jacobian, -at.r, precondition.build(matrix), infinite, loose * at.norm)
+        exact = truncated_cg(jacobian, -at.r, matrix.within(precondition.build(matrix)), infinite, loose * at.norm)
 
         def found(_: None) -> tuple[Vector, Array, Status, Any]:
             return exact.d, jnp.zeros((), jnp.int32), Status.ok(), at.memory
@@ -180,7 +195,7 @@ class NewtonStage(Converged):
 
         return potential
 
-    def _scale(self, stage: Stage) -> Array:
+    def scale(self, stage: Stage, given: None) -> Array:
         """Size of the forces where free [N], each effect by itself, so that a balance of large forces is not taken for their absence."""
         at = stage.predictor
         sizes = [_norm(stage.system.hold(force.force(at))) for force in stage.system.forces]

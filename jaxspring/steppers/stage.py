@@ -7,13 +7,15 @@ Backward Euler, the implicit midpoint rule and BDF2 are this stage with other x0
 
     A = M/h + G + h K
 
-Held coordinates are known beforehand: they are no part of the solve, and do not move by a rounding error.
+Held coordinates are known beforehand: they are no part of the solve, and do not move by a rounding error. So is the velocity along the
+directions that obstacles take from nodes which rest on them (`resting.py`).
 
 Source: slide "Implicit Solution", with the tangent stiffness and the force in place of K x.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -45,6 +47,8 @@ class Stage(eqx.Module):
         known: velocity of held and moved coordinates [m/s] that leads to their place at t, zero elsewhere.
         scheduled: velocity of moved coordinates at t [m/s], zero elsewhere, which damping feels; None where nothing is moved.
         starts_there: whether x0 is the predictor's position (static).
+        taken: directions along which nodes rest, of length one or zero, at right angles; the velocities along them are in `known`.
+        fixed: nodes that rest and stick: all of their velocity is known; None where nothing can rest.
     """
 
     system: BoundSystem
@@ -56,10 +60,16 @@ class Stage(eqx.Module):
     known: Vector
     scheduled: Vector | None
     starts_there: bool = eqx.field(static=True)
+    taken: tuple[Vector, ...] = ()
+    fixed: Array | None = None
+
+    def resting(self, directions: tuple[Vector, ...], sticks: Array, carried: Vector) -> Stage:
+        """The same where nodes rest: these directions are taken, some nodes stick, and what is taken is `carried` [m/s]."""
+        return replace(self, taken=directions, fixed=sticks, known=self.known + carried)
 
     def full(self, y: Vector) -> Vector:
         """`y` where free, the known velocity where not."""
-        return self.system.matrix(Blocks(), self.predictor).pick(y, self.known)
+        return self._of(Blocks()).pick(y, self.known)
 
     def reached(self, y: Vector) -> State:
         """The state that the velocity `y` leads to."""
@@ -75,8 +85,12 @@ class Stage(eqx.Module):
 
     def matrix(self, state: State, linearisation: Linearisation) -> SpringMatrix:
         """M/h + G + h K at a state."""
+        return self.matrix_of(self.blocks(state, linearisation))
+
+    def matrix_of(self, blocks: Blocks) -> SpringMatrix:
+        """These blocks as a matrix, identity where held."""
         # Computed once: without the barrier XLA computes every block anew in each loop and preconditioner that reads it.
-        return lax.optimization_barrier(self.system.matrix(self.blocks(state, linearisation), state))
+        return lax.optimization_barrier(self._of(blocks))
 
     def blocks(self, state: State, linearisation: Linearisation) -> Blocks:
         """M/h + G + h K at a state, no coordinate held."""
@@ -94,7 +108,14 @@ class Stage(eqx.Module):
 
     def on_free(self, r: Vector, y: Vector) -> Vector:
         """Equations where free, y = 0 where known."""
-        return self.system.matrix(Blocks(), self.predictor).pick(r, y)
+        return self._of(Blocks()).pick(r, y)
+
+    def _of(self, blocks: Blocks) -> SpringMatrix:
+        matrix = self.system.matrix(blocks, self.predictor)
+        if self.fixed is None:
+            return matrix
+        free = tuple(~self.fixed if m is None else m & ~self.fixed for m in matrix.free)
+        return replace(matrix, free=free).taking(self.taken)
 
 
 class LinearStage(ImplicitProblem):
@@ -110,8 +131,20 @@ class LinearStage(ImplicitProblem):
 
     def residual(self, stage: Stage, y: Vector) -> Vector:
         """A y - b where free [N]."""
-        blocks = stage.blocks(stage.predictor, self.linearisation)
-        return stage.on_free(blocks.product(stage.full(y)) - self._right_side(stage), y)
+        return stage.on_free(self.unbalanced(stage, self.given(stage), y), y)
+
+    def given(self, stage: Stage) -> tuple[Blocks, Vector]:
+        """A and b, whoever is held."""
+        return stage.blocks(stage.predictor, self.linearisation), self._right_side(stage)
+
+    def unbalanced(self, stage: Stage, given: tuple[Blocks, Vector], y: Vector) -> Vector:
+        """A y - b everywhere [N]: where nodes are held, what holds them."""
+        blocks, right_side = given
+        return blocks.product(stage.full(y)) - right_side
+
+    def scale(self, stage: Stage, given: tuple[Blocks, Vector]) -> Array:
+        """Size of the forces [N]."""
+        return norm(given[1])
 
     def solve_linearised(self, stage: Stage, y: Vector, right_side: Vector) -> Vector:
         """A^-1 right_side."""
@@ -121,13 +154,21 @@ class LinearStage(ImplicitProblem):
     def solve(self, stage: Stage, memory: Any) -> tuple[Vector, SolveInfo, Any]:
         """The stage's velocity with its derivative, how the solve ended, and what the solver carries on."""
         still = stopped(stage)
-        matrix = still.matrix(still.predictor, self.linearisation)
-        right_side = self._right_side(still)
-        if still.system.motion is not None:
-            right_side = right_side - matrix.blocks.product(still.known)
+        y, info, memory = self.find(still, self.given(still), memory)
+        return self.derived(stage, y, info), info, memory
+
+    def find(self, stage: Stage, given: tuple[Blocks, Vector], memory: Any) -> tuple[Vector, SolveInfo, Any]:
+        """The same without a derivative."""
+        blocks, right_side = given
+        matrix = stage.matrix_of(blocks)
+        if stage.system.motion is not None or stage.fixed is not None:
+            right_side = right_side - matrix.blocks.product(stage.known)
         zero = Vector.zeros_like(right_side)
-        y, info, memory = self.solver.find_in_step(matrix, still.on_free(right_side, zero), still.predictor.velocity, memory)
-        return implicitly(self, stage, y), info, memory
+        return self.solver.find_in_step(matrix, stage.on_free(right_side, zero), stage.predictor.velocity, memory)
+
+    def derived(self, stage: Stage, y: Vector, info: SolveInfo) -> Vector:
+        """A solution that `find` gave, with its derivative."""
+        return implicitly(self, stage, y)
 
     def _right_side(self, stage: Stage) -> Vector:
         """b = M v0 / h + f_p + G v_p - K (x0 - x_p) [N]."""

@@ -120,13 +120,15 @@ def examine(net: Topology, points: Numbers, triangles: Numbers | None = None) ->
         points: (N, 3) positions [m].
         triangles: (T, 3) node numbers; None: those of the net.
 
+    Returns:
+        A `MeshReport`; `print` tells it in words.
+
     Raises:
         ValueError: no triangles, points of another shape.
 
     >>> net = from_triangles([(0, 1, 2), (1, 3, 2), (1, 2, 4)], 5)
     >>> print(examine(net, [(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0), (1, 1, 1)]))
-    3 triangles, 1 pieces, 2 holes, least angle 45 degrees
-    neighbours are wound against each other
+    3 triangles, 1 pieces, 1 holes, least angle 45 degrees
     1 sides of more than two triangles, first [1, 2]
     """
     corners = triangles_of(net, triangles)
@@ -168,6 +170,9 @@ def rewound(net: Graph, points: Numbers) -> Graph:
     Args:
         net: a net of triangles with springs along their sides, as `from_triangles` and `from_mesh` make.
         points: (N, 3) positions [m].
+
+    Returns:
+        A `Graph` of the same nodes and sides.
 
     Raises:
         ValueError: a side that more than two triangles share, a surface with one side, such as a Moebius strip.

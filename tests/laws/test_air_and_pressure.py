@@ -54,14 +54,35 @@ def air_in_numpy(points, speeds, time, wind=4.0):
     return force
 
 
+@jax.jit
+def of_air(x, v):
+    """Force, both its derivatives and bounds, in the user's order; and what even motions meet by the blocks and by differentiation."""
+
+    def force(x, v, air=AIR):
+        return jnp.stack([NET.flatten_nodes(a) for a in air.force(state(x, v))], axis=-1)
+
+    by_x, by_v = jax.jacfwd(force, (0, 1))(x, v)
+    level = eqx.tree_at(lambda air: air.lift, AIR, jnp.zeros(()))
+    even = []
+    for axis in range(3):
+        shift = jnp.zeros((5, 3)).at[:, axis].set(1.0)
+        rows = AIR.damping_blocks(state(x, v)).product(NET.vector_field(shift))
+        change = jax.jvp(lambda v: force(x, v, level), (v,), (shift,))[1]
+        even.append((jnp.stack([NET.flatten_nodes(a) for a in rows], axis=-1), -change))
+    bounds = AIR.stiffness_bound(state(x, v)), AIR.damping_bound(state(x, v))
+    return force(x, v), (by_x, by_v), tuple(NET.flatten_nodes(bound) for bound in bounds), even
+
+
 def test_air_is_the_sum_over_triangles():
     """Drag, friction, lift and the linear form as in NumPy; a triangle turned over changes nothing; lift does no work."""
-    np.testing.assert_allclose(flat(NET, AIR.force(state())), air_in_numpy(POINTS, SPEEDS, 0.2), rtol=1e-12, atol=1e-13)
+    found = of_air(POINTS, SPEEDS)[0]
+    np.testing.assert_allclose(found, air_in_numpy(POINTS, SPEEDS, 0.2), rtol=1e-12, atol=1e-13)
     over = js.cloth.Air(NET, *(AIR.drag, 0.1, 0.3, 0.5, 1.3), AIR.wind, triangles=np.asarray(NET.triangles)[:, ::-1])
-    np.testing.assert_allclose(flat(NET, over.force(state())), flat(NET, AIR.force(state())), rtol=1e-13)
     still = js.cloth.Air(NET, drag=0.0, lift=1.0)
     moving = state(speeds=np.tile([0.3, 1.0, -2.0], (5, 1)))
-    assert abs(float(jnp.sum(still.force(moving).dot(moving.velocity)))) < 1e-14
+    turned, power = jax.jit(lambda: (over.force(state()), jnp.sum(still.force(moving).dot(moving.velocity))))()
+    np.testing.assert_allclose(flat(NET, turned), found, rtol=1e-13, atol=1e-13)
+    assert abs(float(power)) < 1e-14
 
 
 def test_still_air_takes_energy_out(rng):
@@ -75,41 +96,29 @@ def test_still_air_takes_energy_out(rng):
 
 def test_jacobians_of_air():
     """dF/dx and dF/dv against central differences to 1e-6; bounds hold; blocks are the sums of the rows of -dF/dv, but for lift."""
-    points, speeds = jnp.asarray(POINTS), jnp.asarray(SPEEDS)
-
-    @jax.jit
-    def force(x, v):
-        return jnp.stack([NET.flatten_nodes(a) for a in AIR.force(state(x, v))], axis=-1).ravel()
-
-    for i, by in enumerate(jax.jit(jax.jacfwd(force, (0, 1)))(points, speeds)):
+    _, jacobians, bounds, even = of_air(POINTS, SPEEDS)
+    for i, (by, bound) in enumerate(zip(jacobians, bounds, strict=True)):
         differences = np.empty((15, 15))
         for k in range(15):
-            step = np.zeros(15)
-            step[k] = 1e-5
-            step = step.reshape(5, 3)
-            up, down = ((points, speeds + sign * step) if i else (points + sign * step, speeds) for sign in (1, -1))
-            differences[:, k] = (force(*up) - force(*down)) / 2e-5
+            step = np.zeros((2, 15))
+            step[i, k] = 1e-5
+            along_x, along_v = step.reshape(2, 5, 3)
+            up, down = (of_air(POINTS + sign * along_x, SPEEDS + sign * along_v)[0] for sign in (1, -1))
+            differences[:, k] = np.ravel(up - down) / 2e-5
         assert reference.relative_error(by.reshape(15, 15), differences) < 1e-6
-        bound = NET.flatten_nodes((AIR.damping_bound if i else AIR.stiffness_bound)(state()))
         blocks = differences.reshape(5, 3, 5, 3).transpose(0, 2, 1, 3)
         assert (np.linalg.norm(blocks, ord=2, axis=(2, 3)).sum(axis=1) <= np.asarray(bound) * 1.0001).all()
-    level = js.cloth.Air(NET, *(AIR.drag, 0.1, None, 0.5, 1.3), AIR.wind)
-    for axis in range(3):
-        shift = js.Vector(tuple(jnp.full(5, float(k == axis)) for k in range(3)))
-        _, change = jax.jvp(lambda v: level.force(eqx.tree_at(lambda s: s.velocity, state(), v)), (state().velocity,), (shift,))
-        np.testing.assert_allclose(flat(NET, level.damping_blocks(state()).product(shift)), -flat(NET, change), rtol=1e-10, atol=1e-12)
+    for by_blocks, by_derivative in even:
+        np.testing.assert_allclose(by_blocks, by_derivative, rtol=1e-10, atol=1e-12)
 
 
 def test_a_triangle_without_area_feels_nothing():
-    """Its force is zero, and so are all derivatives: no NaN."""
+    """Its force is finite, and so are all derivatives: no NaN."""
     points = POINTS.copy()
     points[1] = points[0]
-
-    def total(x):
-        return jnp.sum(AIR.force(state(x)).dot(js.Vector(tuple(jnp.arange(5.0) for _ in range(3)))))
-
-    assert np.isfinite(jax.grad(total)(jnp.asarray(points))).all()
-    assert np.isfinite(flat(NET, AIR.force(state(points)))).all()
+    for found in jax.tree.leaves(of_air(points, SPEEDS)):
+        assert np.isfinite(found).all()
+    np.testing.assert_array_equal(of_air(points, SPEEDS)[0][0], 0)
 
 
 SHEET, PLACES = js.cloth.rectangle(1.0, 0.8, 0.25)
@@ -134,17 +143,28 @@ def test_a_level_sheet_falls_at_its_terminal_speed():
 
 
 def test_a_fall_in_air_and_its_derivatives():
-    """v = v_t tanh(g t / v_t) from rest; derivatives of the speed by rho, C_d and an even upward wind in closed form and by differences."""
-    time, n = 0.6, 60
+    """From rest v = v_t tanh(g t / v_t); derivatives of the speed by rho, C_d and an even upward wind in closed form and by differences."""
+    time, n = 0.6, 120
 
     @jax.jit
     @jax.value_and_grad
     def speed(p):
         rho, drag, up = p
         wind = jnp.stack([jnp.zeros(()), jnp.zeros(()), up])
-        air = js.cloth.Air(SHEET, drag=drag, density=rho, wind=wind)
-        system = js.System(SHEET, MASS, (js.Gravity((0, 0, -G)), air))
-        return -js.rollout(system, falling(0.0), js.RungeKutta4(), time / n, n).state.velocity.z[3]
+        system = js.System(SHEET, MASS, (js.Gravity((0, 0, -G)), js.cloth.Air(SHEET, drag=drag, density=rho, wind=wind)))
+
+        def rate(v):
+            fall = js.Vector(tuple(jnp.full(len(PLACES), a) for a in (0.0, 0.0, -v)))
+            return -system.acceleration(eqx.tree_at(lambda s: s.velocity, falling(0.0), fall)).z[3]
+
+        def step(v, _):
+            h = time / n
+            a = rate(v)
+            b = rate(v + h / 2 * a)
+            c = rate(v + h / 2 * b)
+            return v + h / 6 * (a + 2 * b + 2 * c + rate(v + h * c)), None
+
+        return jax.lax.scan(step, jnp.zeros(()), None, length=n)[0]
 
     rho, drag = 1.25, 1.2
     terminal = np.sqrt(2 * G * DENSITY / (rho * drag))
@@ -163,6 +183,7 @@ def test_a_fall_in_air_and_its_derivatives():
         assert float(slope[k]) == pytest.approx(reference.central_difference(along, at, 1e-4), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_implicit_steps_know_the_air():
     """One linear step far above the explicit limit comes to rest against the wind, and does not overshoot it."""
     air = js.cloth.Air(SHEET, drag=1.2, wind=(0.0, 0.0, 40.0))
@@ -195,42 +216,47 @@ def of_ball(points):
     return js.State.from_points(BALL, points)
 
 
+@eqx.filter_jit
+def forces_of(parts, state):
+    return [part.force(state) for part in parts]
+
+
 def forces_inside():
-    """A constant pressure, a gas, and a gas in a ball with a hole that is capped."""
+    """A constant pressure, and a gas in a ball with a hole that is capped."""
     opened = js.from_triangles(BALL.triangles[np.abs(ROUND[BALL.triangles].mean(axis=1) - ROUND[0]).max(axis=1) > 0.45], len(ROUND))
     return (
         (BALL, js.cloth.Pressure(BALL, ROUND, 50.0)),
-        (BALL, js.cloth.Pressure.of_gas(BALL, ROUND, 50.0, ambient=200.0)),
         (opened, js.cloth.Pressure.of_gas(opened, ROUND, 50.0, ambient=200.0, cap_holes=True)),
     )
 
 
-@pytest.mark.parametrize("case", range(3))
+@pytest.mark.parametrize("case", range(2))
 def test_pressure_is_the_gradient_of_its_energy(case, rng):
     """F = -dE/dx by JAX and by differences; no net force, no net moment; dF/dx against differences to 1e-6; the bound holds."""
     net, pressure = forces_inside()[case]
     points = 1.2 * ROUND + 0.05 * rng.normal(size=ROUND.shape)
 
-    def energy(x):
-        return pressure.energy(js.State.from_points(net, x))
-
     @jax.jit
-    def force(x):
-        return jnp.stack([net.flatten_nodes(a) for a in pressure.force(js.State.from_points(net, x))], axis=-1)
+    def of_pressure(x):
+        def force(x):
+            return jnp.stack([net.flatten_nodes(a) for a in pressure.force(js.State.from_points(net, x))], axis=-1)
 
-    found = np.asarray(force(points))
+        energy, slope = jax.value_and_grad(lambda x: pressure.energy(js.State.from_points(net, x)))(x)
+        bound = net.flatten_nodes(pressure.stiffness_bound(js.State.from_points(net, x)))
+        return force(x), energy, slope, jax.jacfwd(force)(x), bound
+
+    found, _, slope, jacobian, bound = map(np.asarray, of_pressure(points))
     scale = np.abs(found).max()
-    np.testing.assert_allclose(found, -jax.jit(jax.grad(energy))(jnp.asarray(points)), atol=1e-12 * scale)
+    np.testing.assert_allclose(found, -slope, atol=1e-12 * scale)
     np.testing.assert_allclose(found.sum(axis=0), 0, atol=1e-11 * scale)
     np.testing.assert_allclose(np.cross(points, found).sum(axis=0), 0, atol=1e-11 * scale)
-    jacobian = np.asarray(jax.jit(jax.jacfwd(force))(jnp.asarray(points)))
-    for node, axis in ((0, 0), (7, 2), (20, 1)):
+    for node, axis in ((3, 0), (7, 2), (20, 1)):
         step = np.zeros_like(points)
         step[node, axis] = 1e-5
-        differences = np.asarray(force(points + step) - force(points - step)) / 2e-5
-        assert reference.relative_error(jacobian[:, :, node, axis], differences) < 1e-6
+        up, down = of_pressure(points + step), of_pressure(points - step)
+        assert float(up[1] - down[1]) / 2e-5 == pytest.approx(-found[node, axis], rel=1e-6, abs=1e-7 * scale)
+        assert reference.relative_error(jacobian[:, :, node, axis], np.asarray(up[0] - down[0]) / 2e-5) < 1e-6
     rows = np.linalg.norm(jacobian.transpose(0, 2, 1, 3), ord=2, axis=(2, 3)).sum(axis=1)
-    bound = np.asarray(net.flatten_nodes(pressure.stiffness_bound(js.State.from_points(net, points))))
     assert (rows <= bound * (1 + 1e-9)).all()
 
 
@@ -248,43 +274,41 @@ def test_a_gas_follows_boyle():
     assert np.isnan(gas.force(of_ball(-ROUND)).x).all()
 
 
-def test_a_balloon_stands_by_laplace():
-    """At rest each half is held by its cut springs, exactly; tension p R / 2 gives the radius of the closed form within a percent.
+def test_a_balloon_of_twelve_nodes_is_at_rest():
+    """An icosahedron of equal springs: 30 k (a - l) = p dV/da, V = 5 (3 + sqrt 5) a^3 / 12; there no node feels a force, to rounding."""
+    net, points = sphere(0)
+    side = float(np.asarray(net.lengths(points)).mean())
+    k, l, p = 50.0, 0.9 * side, 20.0
+    a = np.roots([p * 5 / 4 * (3 + 5**0.5), -30 * k, 30 * k * l]).min()
+    springs, pressure = js.Springs(net, k, l), js.cloth.Pressure(net, points, p)
+    blown = js.State.from_points(net, a / side * points)
+    assert float(pressure.enclosed(blown)) == pytest.approx(5 * (3 + 5**0.5) * a**3 / 12, rel=1e-13)
+    pulled, pushed = (flat(net, force) for force in forces_of((springs, pressure), blown))
+    assert np.abs(pulled + pushed).max() < 1e-12 * np.abs(pushed).max()
 
-    Springs of stiffness E S / l^2 (nu = 1/3) under an even strain e have the energy 4/3 C e^2 per area, C = 9/8 E: p R (1 + e)^2 = 8/3 C e.
+
+def test_a_sphere_under_pressure_has_the_tension_of_laplace():
+    """p R / 2 = T: on meshes of a sphere of springs of the tension T per length, the balance is met to second order in the spacing.
+
+    Springs of stiffness E S / l^2, stretched by the share e, pull T = 3/2 E e / (1 + e) per length of the stretched sheet, whichever way.
     """
-    net, points = sphere(2)
-    edges = net.edges
-    rest = np.linalg.norm(points[edges[:, 1]] - points[edges[:, 0]], axis=1)
-    a, b, c = (points[net.triangles[:, k]] for k in range(3))
-    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
-    at_side = {}
-    for triangle, area in zip(net.triangles.tolist(), areas, strict=True):
-        for i, j in ((0, 1), (1, 2), (0, 2)):
-            key = tuple(sorted((triangle[i], triangle[j])))
-            at_side[key] = at_side.get(key, 0) + area
-    modulus, p = 100.0, 25.0
-    stiffness = modulus * np.array([at_side[tuple(sorted(edge))] for edge in edges.tolist()]) / rest**2
-    springs, pressure = js.Springs(net, stiffness, rest), js.cloth.Pressure(net, points, p)
-    system = js.System(net, 1.0, (springs, pressure))
-    found = js.equilibrium(system, js.State.from_points(net, points), tolerance=1e-11)
-    js.raise_for_status(found)
-    x = np.asarray(found.state.points)
-    mean = np.linalg.norm(x, axis=1).mean()
-    strain = mean - 1
-    closed = np.roots([p, 2 * p - 8 / 3 * 9 / 8 * modulus, p]).min()
-    assert strain == pytest.approx(closed, rel=0.02)
-    # The springs that leave the upper nodes, against the area vectors of the triangles, summed to the upper nodes by thirds.
-    d = x[edges[:, 1]] - x[edges[:, 0]]
-    length = np.linalg.norm(d, axis=1)
-    pull = (stiffness * (length - rest) / length)[:, None] * d
-    up = x[:, 2] > 0.05
-    leaving = up[edges[:, 0]] & ~up[edges[:, 1]]
-    entering = ~up[edges[:, 0]] & up[edges[:, 1]]
-    held = pull[leaving].sum(axis=0) - pull[entering].sum(axis=0)
-    vectors = np.cross(x[net.triangles[:, 1]] - x[net.triangles[:, 0]], x[net.triangles[:, 2]] - x[net.triangles[:, 0]]) / 2
-    pushed = p * (up[net.triangles].sum(axis=1) / 3) @ vectors
-    np.testing.assert_allclose(held + pushed, 0, atol=1e-8 * np.abs(pushed).max())
+    modulus, e = 100.0, 0.05
+    pressure_of_laplace = 2 / (1 + e) * 1.5 * modulus * e / (1 + e)
+    lacking = []
+    for level in (1, 2):
+        net, points = sphere(level)
+        a, b, c = (points[net.triangles[:, k]] for k in range(3))
+        area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
+        rest = net.lengths(points)
+        # Of the area at a side only its sum matters here.
+        springs = js.Springs(net, 3 * modulus * area / net.n_springs / rest**2, rest)
+        pressure = js.cloth.Pressure(net, points, pressure_of_laplace)
+        state = js.State.from_points(net, (1 + e) * points)
+        pulled, pushed = (flat(net, force) for force in forces_of((springs, pressure), state))
+        # The work of a growth by its own radius.
+        lacking.append(1 + np.sum(pulled * points) / np.sum(pushed * points))
+    assert abs(lacking[1]) < 0.03
+    assert np.log2(lacking[0] / lacking[1]) == pytest.approx(2, abs=0.15)
 
 
 def test_transforms_and_single_precision():
@@ -292,26 +316,29 @@ def test_transforms_and_single_precision():
     tetrahedron = js.from_triangles([(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)], 4)
     corners = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0.1, 0.2, 1.0)])
 
-    def both(p, x, dtype=np.float64):
+    def force(p, x):
         air = js.cloth.Air(tetrahedron, drag=1.2, friction=0.1, lift=0.2, viscous=p, wind=jnp.stack([p, 2 * p, -p]))
-        parts = js.cloth.Pressure.of_gas(tetrahedron, corners, 10.0 * p), air
-        system = js.System(tetrahedron, np.ones(4, dtype), parts)
-        state = js.State.from_points(tetrahedron, jnp.asarray(x, dtype), jnp.asarray(-x, dtype))
-        return jnp.stack([tetrahedron.flatten_nodes(a) for a in system.force(state)], axis=-1), parts[0]
+        gas = js.cloth.Pressure.of_gas(tetrahedron, corners, 10 * p)
+        state = js.State.from_points(tetrahedron, x, -x)
+        parts = js.System(tetrahedron, jnp.ones(4, x.dtype), (gas, air)).bind(x.dtype).forces
+        return jnp.stack([sum(tetrahedron.flatten_nodes(part.force(state)[i]) for part in parts) for i in range(3)], axis=-1)
+
+    def derivatives(x):
+        gas = js.cloth.Pressure.of_gas(tetrahedron, corners, 10.0)
+
+        def inside(x):
+            return jnp.stack([tetrahedron.flatten_nodes(a) for a in gas.force(js.State.from_points(tetrahedron, x))], axis=-1)
+
+        hessian = jax.hessian(lambda x: gas.energy(js.State.from_points(tetrahedron, x)))(x)
+        return hessian, jax.jacfwd(inside)(x)
 
     ps, x = jnp.array([0.5, 1.0, 2.0]), jnp.asarray(1.1 * corners)
-    batch = jax.jit(jax.vmap(lambda p: both(p, x)[0]))(ps)
-    single = jax.jit(lambda p: both(p, x)[0])
+    hessian, jacobian = jax.jit(derivatives)(x)
+    batch = jax.jit(jax.vmap(force, (0, None)))(ps, x)
+    single = jax.jit(force)
     for p, found in zip(ps, batch, strict=True):
-        np.testing.assert_allclose(found, single(p), rtol=1e-11, atol=1e-12 * 101325)
-    gas = both(1.0, x)[1]
-
-    def of(method):
-        return lambda x: method(js.State.from_points(tetrahedron, x))
-
-    hessian = jax.jit(jax.hessian(of(gas.energy)))(x)
-    jacobian = jax.jit(jax.jacfwd(lambda x: jnp.stack([tetrahedron.flatten_nodes(a) for a in of(gas.force)(x)], axis=-1)))(x)
+        np.testing.assert_allclose(found, single(p, x), rtol=1e-11, atol=1e-12 * 101325)
     np.testing.assert_allclose(hessian, -jacobian, rtol=1e-10, atol=1e-6)
-    low = both(np.float32(1.0), np.asarray(x, np.float32), np.float32)[0]
+    low = single(np.float32(1.0), np.asarray(x, np.float32))
     assert low.dtype == np.float32
-    np.testing.assert_allclose(low, both(1.0, x)[0], rtol=3e-5, atol=0.05)
+    np.testing.assert_allclose(low, batch[1], rtol=3e-5, atol=0.05)

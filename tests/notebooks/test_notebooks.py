@@ -14,6 +14,7 @@ PROMISED = [
     "02_fit_a_mesh_to_an_image",
     "03_stiff_springs",
     "04_heat_and_melting",
+    "05_contact_and_gradients",
     "06_a_robot_that_walks",
     "07_cloth_in_measured_units",
 ]

@@ -72,7 +72,7 @@ def _material(given: str | tuple[float, ...]) -> Any:
     from ...cloth.materials import DENIM, INTERLOCK, SWIM_KNIT, Fabric
 
     if isinstance(given, str):
-        return dict(zip(FABRICS, (INTERLOCK, DENIM, SWIM_KNIT), strict=True))[given]
+        return (INTERLOCK, DENIM, SWIM_KNIT)[FABRICS.index(given)]
     density, warp, weft, shear, bending = given
     try:
         return Fabric(density, (warp, weft), shear, bending)

@@ -81,7 +81,7 @@ class ClothRun(PartedRun):
         names = ["motion", *(type(force).__name__ for force in self.scene.system.forces)]
         named = {name: energy[:, i] for i, name in enumerate(names) if name != "Air"}
         named["Gravity"] = named["Gravity"] - named["Gravity"][0]
-        triangles = np.asarray(self.scene.cloth.net.triangles)
+        triangles = np.asarray(self.scene.triangles)
         return Frames(time, points, named, strains(self.scene.points, points, triangles), triangles, solid(self.scene))
 
 

@@ -86,6 +86,7 @@ class ClothScene(eqx.Module):
 
     Attributes:
         cloth: net, springs, hinges and masses.
+        triangles: (F, 3) of the net.
         points: (N, 3) at rest [m].
         system: with gravity, air and obstacles.
         state: the start.
@@ -96,6 +97,7 @@ class ClothScene(eqx.Module):
     """
 
     cloth: Cloth
+    triangles: np.ndarray
     points: np.ndarray
     system: System
     state: State
@@ -176,8 +178,8 @@ def on_table(settings: ClothSettings) -> ClothScene:
     """
     net, points = rectangle(settings.size, settings.size, settings.spacing)
     middle, top = points.mean(axis=0), -0.01 * settings.size
-    ends = [(middle[0], middle[1], top - depth * settings.size) for depth in (0.0, 1.0)]
-    return _scene(settings, net, points, None, Cylinder(*ends, 0.3 * settings.size))
+    upper, lower = ((middle[0], middle[1], top - depth * settings.size) for depth in (0.0, 1.0))
+    return _scene(settings, net, points, None, Cylinder(upper, lower, 0.3 * settings.size))
 
 
 def flag(settings: ClothSettings) -> ClothScene:
@@ -283,8 +285,9 @@ def _scene(
     rules = () if obstacle is None else Contact(obstacle, friction=settings.friction)
     system = System(net, cloth.mass, forces, free=None if held is None else ~held, rules=rules)
     state = State.from_points(net, flat if places is None else places)
-    border = max(borders(np.asarray(net.triangles)), key=len)
-    return ClothScene(cloth, flat, system, state, BackwardEuler(), obstacle, np.asarray(border), settings)
+    triangles = np.asarray(net.triangles)
+    border = max(borders(triangles), key=len)
+    return ClothScene(cloth, triangles, flat, system, state, BackwardEuler(), obstacle, np.asarray(border), settings)
 
 
 SCENES: dict[str, Builder] = {

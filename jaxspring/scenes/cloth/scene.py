@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -116,7 +116,7 @@ class ClothScene(eqx.Module):
         """
         cloth = fabric(self.cloth.net, self.points, material)
         forces = (*cloth.forces, *self.system.forces[len(cloth.forces) :])
-        free = None if self.system.free is None else cloth.net.flatten_nodes(self.system.free)
+        free = None if self.system.free is None else cloth.net.flatten_nodes(cast(Array, self.system.free))  # whole nodes
         system = System(cloth.net, cloth.mass, forces, free=free, rules=self.system.rules or ())
         return replace(self, cloth=cloth, system=system, settings=replace(self.settings, material=material))
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -26,7 +26,7 @@ from jaxtyping import Array
 from ..._checks import positive
 from ...cloth.constants import Cloth, fabric
 from ...cloth.materials import INTERLOCK, Material
-from ...cloth.meshes import disc, rectangle
+from ...cloth.meshes import ROW, disc, rectangle
 from ...contact.base import Obstacle
 from ...contact.obstacles import Cylinder, Sphere
 from ...contact.rule import Contact
@@ -41,6 +41,7 @@ from ...vector import Vector
 
 GRAVITY = 9.81  # [m/s^2]
 SUPPORT, SPECIMEN = 0.09, 0.15  # radii of Cusick's test [m]
+AT_EDGE = 0.4  # spacings
 CHORD = 41.5  # degrees below the horizontal at which the bending test reads its length
 
 
@@ -115,7 +116,7 @@ class ClothScene(eqx.Module):
         """
         cloth = fabric(self.cloth.net, self.points, material)
         forces = (*cloth.forces, *self.system.forces[len(cloth.forces) :])
-        free = None if self.system.free is None else cloth.net.flatten_nodes(self.system.free)
+        free = None if self.system.free is None else cloth.net.flatten_nodes(cast(Array, self.system.free))  # whole nodes
         system = System(cloth.net, cloth.mass, forces, free=free, rules=self.system.rules or ())
         return replace(self, cloth=cloth, system=system, settings=replace(self.settings, material=material))
 
@@ -203,7 +204,11 @@ def flag(settings: ClothSettings) -> ClothScene:
 
 
 def cantilever(settings: ClothSettings) -> ClothScene:
-    """A strip, clamped level at one end: the bending test. Its rows lie across it, about which it bends.
+    """A strip, clamped level at one end: the bending test. Its rows lie across it, about which it bends; of warp, along x.
+
+    The first bend is at the clamp's last row, and stands for half a row to either side: the free length begins half a row before it.
+    Across, a net of triangles and hinges has Poisson's ratio -1/3: a strip that is narrow, or soft to stretch, bends as with up to a ninth
+    less than B.
 
     Args:
         settings: fabric, free length (`size`), spacing.
@@ -213,12 +218,14 @@ def cantilever(settings: ClothSettings) -> ClothScene:
 
     >>> scene = cantilever(ClothSettings(size=0.08, spacing=0.02))
     >>> n_held = int((~scene.system.free).sum())
-    >>> n_held, len(scene.points), round(float(scene.points[:, 0].max()), 3)  # the clamp is two spacings long
-    (18, 45, 0.12)
+    >>> n_held, len(scene.points), round(float(scene.points[:, 0].max()), 3)  # x begins at the clamp
+    (16, 33, 0.08)
     """
-    width = max(4 * settings.spacing, settings.size / 8)
-    net, points = rectangle(settings.size + 2 * settings.spacing, width, settings.spacing)
-    clamped = points[:, 0] < 2 * settings.spacing + 1e-9
+    n_rows = max(2, round(settings.size / (ROW * settings.spacing) - 0.5))
+    row = settings.size / (n_rows + 0.5)
+    net, across = rectangle(max(4 * settings.spacing, settings.size / 4), (n_rows + 2) * row, row / ROW)
+    points = across[:, [1, 0, 2]] - [1.5 * row, 0, 0]
+    clamped = points[:, 0] < 0.75 * row
     return _scene(settings, net, points, clamped)
 
 
@@ -236,7 +243,12 @@ def cusick(settings: ClothSettings) -> ClothScene:
     1.0
     """
     net, points = disc(SPECIMEN, settings.spacing)
-    held = np.hypot(points[:, 0], points[:, 1]) < SUPPORT + 1e-9
+    away = np.hypot(points[:, 0], points[:, 1])
+    # What is near to the edge of the support is put onto it, else the overhang would be that of the mesh; nearer than half of a triangle's
+    # height, so that no triangle has all its corners there.
+    near = np.abs(away - SUPPORT) < AT_EDGE * settings.spacing
+    points[near] *= (SUPPORT / away[near])[:, None]
+    held = near | (away < SUPPORT)
     return _scene(settings, net, points, held)
 
 
@@ -318,11 +330,10 @@ def drape_coefficient(scene: ClothScene, state: State) -> Array:
 
 
 def chord_angle(scene: ClothScene, state: State) -> Array:
-    """How far the chord from the clamp to the free end of a cantilever points below the horizontal [degrees]."""
+    """How far the chord from the clamp, at x = 0, to the free end of a cantilever points below the horizontal [degrees]."""
     end = scene.points[:, 0] > scene.points[:, 0].max() - 1e-9
-    start = scene.points[:, 0].min() + 2 * scene.settings.spacing
     tip = jnp.mean(state.points[np.flatnonzero(end)], axis=0)
-    return jnp.degrees(jnp.arctan2(-tip[2], tip[0] - start))
+    return jnp.degrees(jnp.arctan2(-tip[2], tip[0]))
 
 
 __all__ = [

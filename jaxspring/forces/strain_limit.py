@@ -59,7 +59,7 @@ class StrainLimit(SpringRule):
     >>> start = js.State.from_points(net, [[0.0], [1.3], [2.2]])
     >>> end = js.rollout(system, start, js.SymplecticEuler(), dt=1e-3, n_steps=1).state
     >>> print(end.points[:, 0].round(3))
-    [0.    1.1   2.199]
+    [0.  1.1 2.2]
     """
 
     moves: ClassVar[bool] = True

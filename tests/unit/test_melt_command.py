@@ -12,6 +12,7 @@ import pytest
 import jaxspring as js
 from jaxspring import cli
 from jaxspring.cli import main
+from jaxspring.scenes import parts
 from jaxspring.scenes.melting import job
 from jaxspring.scenes.melting.scene import MeltSettings, melting_block
 
@@ -131,13 +132,13 @@ def check_full_disk(run, out, capsys, monkeypatch):
     assert "there is no checkpoint" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("command", [["melt"], ["fit", "--nodes", "3x3"]])
+@pytest.mark.parametrize("command", [["melt"], ["fit", "--nodes", "3x3"], ["cloth"]])
 @pytest.mark.parametrize("missing", ["matplotlib.figure", "PIL.Image"])
 def test_what_draws_is_asked_for_before_the_work(command, missing, tmp_path, capsys, monkeypatch):
-    """Without matplotlib or Pillow both commands end at once, with code 2 and the name of the extra; nothing is computed or written."""
+    """Without matplotlib or Pillow the commands end at once, with code 2 and the name of the extra; nothing is computed or written."""
     np.save(tmp_path / "hill.npy", np.arange(30.0).reshape(5, 6))
     monkeypatch.setitem(sys.modules, missing, None)
-    monkeypatch.setattr(job, "rollout", None)
+    monkeypatch.setattr(parts, "rollout", None)
     image = [str(tmp_path / "hill.npy")] if command[0] == "fit" else []
     assert main([*command, *image, "--out", str(tmp_path / "out")]) == cli.UNUSABLE
     assert "pip install jaxspring[viz]" in capsys.readouterr().err

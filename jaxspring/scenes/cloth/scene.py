@@ -219,7 +219,7 @@ def cantilever(settings: ClothSettings) -> ClothScene:
     >>> scene = cantilever(ClothSettings(size=0.08, spacing=0.02))
     >>> n_held = int((~scene.system.free).sum())
     >>> n_held, len(scene.points), round(float(scene.points[:, 0].max()), 3)  # x begins at the clamp
-    (16, 33, 0.08)
+    (16, 38, 0.08)
     """
     n_rows = max(2, round(settings.size / (ROW * settings.spacing) - 0.5))
     row = settings.size / (n_rows + 0.5)

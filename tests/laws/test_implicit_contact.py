@@ -247,3 +247,22 @@ def test_a_scene_without_obstacles_holds_none_of_it():
     memory = js.BackwardEuler().init(floor, start)
     other = str(jax.make_jaxpr(lambda s: js.BackwardEuler().step(floor, s, jnp.asarray(0.1), memory)[0].position)(start))
     assert len(program) < 0.8 * len(other)
+
+
+@pytest.mark.slow
+def test_reverse_mode_in_float32():
+    """The gradient by the stiffness of a column that sinks onto its floor is that of central differences in float64, and the tangent's."""
+    chain, number = js.lattice(4), np.float32
+    start = js.State.from_points(chain, jnp.arange(4, dtype=number)[:, None])
+
+    @jax.jit
+    def top(k):
+        forces = (js.Springs(chain, k, number(1)), js.Gravity(jnp.full(1, -10, number)), js.Drag(number(2)))
+        system = js.System(chain, number(1), forces, rules=js.Floor(jnp.zeros(1, number), jnp.ones(1, number)))
+        return js.rollout(system, start, js.BackwardEuler(), number(0.05), 20).state.points[-1, 0]
+
+    k = number(100)
+    slope = jax.grad(top)(k)
+    assert slope.dtype == number
+    assert float(slope) == pytest.approx(0.00996215018, rel=1e-3)
+    assert float(jax.jvp(top, (k,), (number(1),))[1]) == pytest.approx(float(slope), rel=1e-4)

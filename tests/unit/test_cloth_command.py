@@ -30,6 +30,7 @@ FEW = js.cloth.ClothSettings(size=0.2, spacing=0.05)
         ["--size=0.02"],
         ["--spacing=1e-4"],
         ["--dt=-0.01"],
+        ["--wind=nan"],
         ["--duration=soon"],
         ["--resume"],
     ],

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..._checks import positive
+from ..._checks import finite, nonnegative, positive
 from ...cloth.constants import Cloth, fabric
 from ...cloth.materials import INTERLOCK, Material
 from ...cloth.meshes import ROW, disc, rectangle
@@ -77,6 +77,8 @@ class ClothSettings:
     def __post_init__(self) -> None:
         for name in ("size", "spacing", "duration", "dt"):
             positive(name, np.asarray(getattr(self, name), float), "Give it in metres or seconds.")
+        nonnegative("friction", np.asarray(self.friction, float), "It would push the cloth on.")
+        finite("wind", np.asarray(self.wind, float))
         if self.size < 2 * self.spacing:
             raise ValueError(f"size = {self.size} is less than two spacings of {self.spacing}; expected more nodes than that.")
 

@@ -145,7 +145,7 @@ class BoundSystem(Nodes):
             pushed: change of velocity that obstacles gave in the step already [m/s], or None.
         """
         total, followers = Status.ok(), self.followers
-        obstacles = tuple((i, part) for i, part in followers if part.is_obstacle)
+        obstacles = tuple(i for i, part in followers if part.is_obstacle)
         drivers = tuple((i, part) for i, part in followers if part.drives)
         watchers = tuple((i, part) for i, part in followers if part.watches)
         step, stages, impacts = self._step(before, state, dt, bool(obstacles)), [], None
@@ -157,7 +157,7 @@ class BoundSystem(Nodes):
         if obstacles:
             is_kicked = any(part.moves for _, part in followers if not part.is_obstacle)
             state, status, impacts = _struck(self.obstacles, replace(step, pushed=pushed), state, bool(watchers), is_kicked)
-            total = total.then(_placed(status, obstacles[0][0]))
+            total = total.then(_placed(status, obstacles[0]))
             stages.append((-1, state))
         for i, part in drivers:
             state, status = _updated(part, step, state)
@@ -173,11 +173,6 @@ class BoundSystem(Nodes):
     def obstacles(self) -> tuple[Rule, ...]:
         """What nodes cannot enter."""
         return tuple(part for _, part in self.followers if part.is_obstacle)
-
-    @property
-    def has_moving_obstacles(self) -> bool:
-        """Whether an obstacle may do work on what rests on it."""
-        return any(getattr(getattr(part, "obstacle", None), "moves", False) for part in self.obstacles)
 
     def resting(self, state: State, origin: Vector, span: Array, end: Array) -> Any:
         """What obstacles can take from nodes that rest on them, in a step from a state: see `Resting.of`; None where there are none."""

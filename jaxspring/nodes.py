@@ -68,7 +68,7 @@ class Nodes(eqx.Module):
 
     def hold(self, v: Vector) -> Vector:
         """`v` where free, zero where held."""
-        return Vector(tuple(a if m is None else jnp.where(m, a, jnp.zeros_like(a)) for a, m in zip(v, self.free_masks(v.dim), strict=True)))
+        return v.where(self.free_masks(v.dim))
 
     def constrain(self, state: State) -> State:
         """The state with held nodes at rest and moved nodes on their schedule."""

@@ -135,6 +135,11 @@ class Vector(eqx.Module):
     def __truediv__(self, other: Operand) -> Vector:
         return _combine(jnp.divide, self, other)
 
+    def where(self, masks: tuple[Array | None, ...]) -> Vector:
+        """The same where the mask of a coordinate holds, zero elsewhere; None: everywhere."""
+        entries = zip(self, masks, strict=True)
+        return Vector(tuple(a if mask is None else jnp.where(mask, a, jnp.zeros_like(a)) for a, mask in entries))
+
     @staticmethod
     def zeros_like(other: Vector) -> Vector:
         """A zero vector field of the same shape and dtype."""

@@ -25,6 +25,7 @@ from ..forces.springs import Springs
 from ..topology.builders import from_triangles
 from ..topology.graph import Graph
 from ..topology.lattice import BEND, SHEAR, STRUCTURAL, Lattice, lattice
+from ..topology.mesh_checks import runs
 from .moduli import twice_areas
 
 # Height of a triangle over its side.
@@ -256,7 +257,7 @@ def _filled(border: np.ndarray, spacing: float, middle: np.ndarray) -> tuple[Gra
 
 def _middles(triangles: np.ndarray, points: np.ndarray) -> np.ndarray:
     """(N, 2) the mean of each node's neighbours."""
-    sides = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    sides = runs(triangles)
     pairs = np.unique(np.sort(sides, axis=1), axis=0)
     both = np.concatenate([pairs, pairs[:, ::-1]])
     degree = np.bincount(both[:, 0], minlength=len(points))
@@ -272,7 +273,7 @@ def _counterclockwise(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 def _check(points: np.ndarray, triangles: np.ndarray, n_border: int, spacing: float) -> None:
     """Raise ValueError unless the triangles end at the border, use all nodes, and none is a sliver."""
     n_nodes = len(points)
-    sides = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]).astype(np.int64)
+    sides = runs(triangles)
     there, back = sides[:, 0] * n_nodes + sides[:, 1], sides[:, 1] * n_nodes + sides[:, 0]
     ends = np.sort(there[~np.isin(there, back)])
     i = np.arange(n_border)

@@ -20,6 +20,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from .._checks import as_inexact
+from ..topology.mesh_checks import runs
 
 
 class Moduli(eqx.Module):
@@ -73,7 +74,7 @@ def turns(points: np.ndarray, hinges: np.ndarray, triangles: np.ndarray) -> np.n
     """
     x, y = points.T
     turned = sum(_slope(points, hinges[:, [0, 1, k]], np.stack([x * x, y * y, x * y], axis=-1) / 2) for k in (2, 3))
-    sides = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
+    sides = np.sort(runs(triangles), axis=1)
     known = {tuple(pair): i for i, pair in enumerate(np.sort(hinges[:, :2], axis=1).tolist())}
     hinge = np.array([known.get(tuple(pair), -1) for pair in sides.tolist()]).reshape(3, -1)
     inner = (hinge >= 0).all(axis=0)

@@ -65,7 +65,7 @@ class Passage(eqx.Module):
 
     def free_part(self, v: Vector) -> Vector:
         """`v` where free, zero where held."""
-        return Vector(tuple(a if m is None else jnp.where(m, a, jnp.zeros_like(a)) for a, m in zip(v, self.free, strict=True)))
+        return v.where(self.free)
 
     def lever(self, normal: Vector) -> tuple[Vector, Array]:
         """Change of velocity per unit of change along a normal, where nodes are free, and its length: the normal, and 1, of free nodes."""

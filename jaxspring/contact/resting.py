@@ -103,7 +103,7 @@ class Resting(eqx.Module):
             base = counted_from(surface.distance(x, state.time), least)
             touch = surface.touch(x, now, base)
             is_on = (touch.height <= least) & is_slow(touch.speed(v), acceleration.norm(), span, least)
-            normals.append(_free_part(touch.normal, free))
+            normals.append(touch.normal.where(free))
             rates.append(touch.rate)
             # Where nothing moves, the end of the step is seen from where it begins.
             stands = origin is x and not surface.obstacle.moves
@@ -115,9 +115,9 @@ class Resting(eqx.Module):
             grips.append(is_on & (surface.friction > 0))
             rounding.append(jnp.broadcast_to(least, now.shape))
             if touch.drag is not None and last.drag is not None:
-                drag = drag + is_on.astype(base.dtype) * _free_part(touch.drag, free)
-                drag_at_end = drag_at_end + is_on.astype(base.dtype) * _free_part(last.drag, free)
-        slip = frame_of(tuple(normals), tuple(rates), tuple(lies)).without(_free_part(v, free) - drag)
+                drag = drag + is_on.astype(base.dtype) * touch.drag.where(free)
+                drag_at_end = drag_at_end + is_on.astype(base.dtype) * last.drag.where(free)
+        slip = frame_of(tuple(normals), tuple(rates), tuple(lies)).without(v.where(free) - drag)
         still = is_slow(slip.norm(), acceleration.norm(), span, sum(rounding[1:], start=rounding[0]))
         held = Held(tuple(lies), _any(tuple(grips)) & still)
         at_end = (tuple(ends), drag_at_end) if any(s.obstacle.moves for s in surfaces) else None
@@ -158,12 +158,8 @@ class Resting(eqx.Module):
 
     def _parts(self, held: Held, force: Vector) -> tuple[tuple[Array, ...], Vector]:
         """Of a force, what is along each normal, and what is along the surfaces [N]."""
-        frame, force = self._frame(held), _free_part(force, self.free)
+        frame, force = self._frame(held), force.where(self.free)
         return frame.shares(tuple(force.dot(e) for e in frame.directions)), frame.without(force)
-
-
-def _free_part(v: Vector, free: tuple[Array | None, ...]) -> Vector:
-    return Vector(tuple(a if m is None else jnp.where(m, a, jnp.zeros_like(a)) for a, m in zip(v, free, strict=True)))
 
 
 def _any(flags: tuple[Array, ...]) -> Array:

@@ -63,6 +63,11 @@ class Contact(Rule):
         self.obstacle = kind("obstacle", obstacle, Obstacle, "Sphere((0.0, 0.0), 1.0)")
         self.friction, self.restitution = coefficients(friction, restitution)
 
+    @property
+    def does_work(self) -> bool:
+        """Whether the obstacle moves."""
+        return self.obstacle.moves
+
     def bind(self, scene: Scene) -> Self:
         """The same with all constants in the dtype of the state."""
         bound = cast_inexact(self, scene.dtype)

@@ -13,7 +13,7 @@ import numpy as np
 from .._arrays import Numbers
 from ..archive import Path
 from ..topology.base import Topology
-from ..topology.mesh_checks import triangles_of
+from ..topology.mesh_checks import runs, triangles_of
 from .frames import Frames, States, frames_of
 from .places import write_frames
 
@@ -69,7 +69,7 @@ def save_stl(path: Path, states: States, net: Topology, triangles: Numbers | Non
 def _obj(frames: Frames, i: int) -> bytes:
     """The text of frame i."""
     triangles = frames.triangles
-    sides = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]).astype(np.int64)
+    sides = runs(triangles)
     n = frames.points.shape[1]
     edges = frames.edges if frames.alive is None else frames.edges[frames.alive[i]]
     keys, own = (np.sort(pairs.astype(np.int64), axis=1) @ [n, 1] for pairs in (sides, edges))

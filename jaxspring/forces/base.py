@@ -142,6 +142,11 @@ class Rule(eqx.Module):
         """Whether, as it was made, it does nothing after a step and remembers nothing, though its class can."""
         return False
 
+    @property
+    def does_work(self) -> bool:
+        """Whether it may do work on what rests on it: an obstacle that moves."""
+        return False
+
     def check(self, scene: Scene) -> None:
         """Raise ValueError where it does not fit the system. Called when the system is made, and when it is bound."""
 

@@ -152,9 +152,7 @@ class StrainLimit(SpringRule):
             return (share * inverse_length(d.dot(d))) * d
 
         pulls = map_living(self.net, state, impulse, self.net.difference(x), over, busiest, self.net.average(light))
-        moved = light * self.net.accumulate(pulls)
-        inside = zip(moved, free, strict=True)
-        return x + Vector(tuple(a if mask is None else jnp.where(mask, a, jnp.zeros_like(a)) for a, mask in inside))
+        return x + (light * self.net.accumulate(pulls)).where(free)
 
 
 __all__ = ["StrainLimit"]

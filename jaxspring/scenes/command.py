@@ -117,6 +117,16 @@ def settings_of(kind: Callable[..., Settings], given: argparse.Namespace, names:
         raise UnusableError(str(error)) from error
 
 
+def add_out(parser: argparse.ArgumentParser, default: str) -> None:
+    """The argument `--out`, for `out_folder`."""
+    parser.add_argument("--out", metavar="DIR", default=default, help="folder for the results; an older result there is replaced")
+
+
+def out_folder(given: argparse.Namespace) -> pathlib.Path:
+    """Where the results go."""
+    return pathlib.Path(given.out)
+
+
 def number(text: str) -> float:
     """An argument that is a finite number."""
     try:
@@ -142,10 +152,12 @@ __all__ = [
     "StoppedError",
     "UnusableError",
     "Written",
+    "add_out",
     "check_folder",
     "check_replaceable",
     "file_names",
     "number",
+    "out_folder",
     "settings_of",
     "whole_number",
 ]

@@ -20,3 +20,15 @@ def canvas_and_figure() -> tuple[Any, Any]:
     except ImportError as error:
         raise ImportError("Pictures need matplotlib and Pillow: pip install jaxspring[viz]") from error
     return FigureCanvasAgg, Figure
+
+
+def new_figure(width: float, height: float, dpi: int, layout: str | None = "constrained") -> Any:
+    """An empty figure of this size [inches], drawn without a window.
+
+    Raises:
+        ImportError: matplotlib or Pillow is not installed.
+    """
+    canvas, figure_of = canvas_and_figure()
+    figure = figure_of((width, height), dpi, layout=layout)
+    canvas(figure)
+    return figure

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 import pathlib
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -21,6 +22,8 @@ from ..state import State
 from ..status import Status
 from ..steppers.base import Stepper
 from ..system import System
+from .command import FailedError, StoppedError, Written
+from .folder import ResultFolder
 
 FRAMES = 60
 
@@ -33,6 +36,7 @@ class PartedRun:
         frames: what was seen until now, the start included: what `look` gives, each with an axis of frames.
         status: of all parts.
         effects: names for the status.
+        done_before: frames that an earlier call has done.
         n_frames, every, dt: frames besides the start, steps between them, and the step, such that equal frames fill the duration [s].
     """
 
@@ -43,7 +47,7 @@ class PartedRun:
         self.dt = duration / (self.every * self.n_frames)
         self.per_part = 3 if self.n_frames == FRAMES else 1
         self.state = system.bind(state.dtype).begin(state)
-        self.status, self.effects = Status.ok(), ()
+        self.status, self.effects, self.done_before = Status.ok(), (), 0
         self.frames = jax.tree.map(lambda a: np.asarray(a)[None], look(self.state))
         self._about = {"form": FORM, "dtype": str(state.dtype), **json.loads(json.dumps(about))}
 
@@ -63,6 +67,32 @@ class PartedRun:
                 self._write(keep)
             if progress is not None:
                 progress.update(self.done, self.n_frames)
+
+    def complete(
+        self, out: pathlib.Path, finish: Callable[[ResultFolder], Written], progress: Progress | None = None, resume: bool = False
+    ) -> Written:
+        """To the end, and what `finish` writes; or on from where an earlier call was interrupted.
+
+        Raises:
+            OSError: there is no checkpoint to go on from, or none can be written.
+            CheckpointError: the checkpoint is damaged or of other settings.
+            StoppedError: Ctrl-C; there is a checkpoint to go on from.
+            FailedError: the run failed.
+        """
+        place = ResultFolder(out)
+        if resume:
+            place.take_up()
+            self.read(place.checkpoint)
+        self.done_before = self.done
+        try:
+            self.go_on(progress, place.checkpoint)
+            if not bool(self.status.is_ok):
+                raise FailedError(f"the run failed: {self.status.describe(self.effects)}.")
+            return finish(place)
+        except KeyboardInterrupt:
+            if self.done == 0:
+                raise
+            raise StoppedError(f"{self.done} frames") from None
 
     def _write(self, path: pathlib.Path) -> None:
         arrays = {f"state/{name}": array for name, array in named_arrays(self.state).items()}

@@ -40,7 +40,7 @@ class EnergyWatch(eqx.Module):
     @staticmethod
     def of(system: BoundSystem, state: State) -> EnergyWatch | None:
         """Before the first step; None where something in the system can feed energy in."""
-        if system.motion is not None or system.has_moving_obstacles or any(force.can_feed for force in system.forces):
+        if system.motion is not None or any(force.can_feed for force in system.forces) or any(part.does_work for part in system.obstacles):
             return None
         parts = _parts(system, state)
         return EnergyWatch(parts, jnp.sum(parts), parts, parts, jnp.zeros((), state.dtype))

@@ -25,6 +25,11 @@ from .lattice import Lattice
 FLAT = 1e-12
 
 
+def runs(triangles: np.ndarray) -> np.ndarray:
+    """(3 T, 2) the sides along which triangles run, corner after corner: a b of all triangles, then b c, then c a."""
+    return np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]).astype(np.int64)
+
+
 class Sides:
     """The sides of T triangles.
 
@@ -36,7 +41,7 @@ class Sides:
     """
 
     def __init__(self, triangles: np.ndarray):
-        run = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]).astype(np.int64)
+        run = runs(triangles)
         self.up = run[:, 0] < run[:, 1]
         self.pairs, self.of, self.counts = np.unique(np.sort(run, axis=1), axis=0, return_inverse=True, return_counts=True)
         self.of = self.of.ravel()
@@ -259,7 +264,7 @@ def borders(triangles: np.ndarray) -> list[np.ndarray]:
     Raises:
         ValueError: two holes that meet at a node.
     """
-    run = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]).astype(np.int64)
+    run = runs(triangles)
     sides = Sides(triangles)
     ends = run[sides.counts[sides.of] == 1]
     following = {int(b): int(a) for a, b in ends}
@@ -316,6 +321,7 @@ __all__ = [
     "pieces",
     "refuse_crowded",
     "rewound",
+    "runs",
     "signed_volumes",
     "triangles_of",
     "winding",

@@ -6,7 +6,7 @@ import argparse
 import pathlib
 from typing import Any
 
-from ..command import Command, UnusableError, Written, number, settings_of
+from ..command import Command, UnusableError, Written, add_out, number, out_folder, settings_of
 
 # The scenes of `scene.SCENES`, and the published fabrics; said again here, since nothing heavy is imported for `--help`.
 NAMES = ("hanging", "ball", "table", "flag", "cantilever", "drape")
@@ -28,13 +28,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--duration", type=number, metavar="S", help="simulated time in seconds (2)")
     parser.add_argument("--dt", type=number, metavar="S", help="time step in seconds (0.01)")
     parser.add_argument("--wind", type=number, metavar="V", help="speed of the air on the flag in m/s (6)")
-    parser.add_argument("--out", metavar="DIR", default="jaxspring-cloth", help="folder for the results; an older result there is replaced")
+    add_out(parser, "jaxspring-cloth")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint of an interrupted run with the same DIR")
-
-
-def folder(given: argparse.Namespace) -> pathlib.Path:
-    """Where the results go."""
-    return pathlib.Path(given.out)
 
 
 def run(given: argparse.Namespace, out: pathlib.Path) -> Written:
@@ -114,6 +109,6 @@ COMMAND = Command(
     description="A sheet of a measured fabric: hung, laid over a ball or a table, a flag, or a test of a fabric laboratory. "
     "Writes a report, the mesh, frames for ParaView, pictures and an animation.",
     add_arguments=add_arguments,
-    folder=folder,
+    folder=out_folder,
     run=run,
 )

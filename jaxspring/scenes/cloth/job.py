@@ -21,7 +21,7 @@ from ...export.vtk import save_vtk
 from ...progress import Progress, Stopwatch
 from ...state import State
 from ...system import System
-from ..command import FailedError, StoppedError, Written
+from ..command import Written
 from ..drawing import canvas_and_figure
 from ..folder import ResultFolder, versions
 from ..parts import PartedRun
@@ -75,6 +75,12 @@ class ClothRun(PartedRun):
         n_steps = max(1, round(settings.duration / settings.dt))
         super().__init__(scene.system, scene.state, scene.stepper, n_steps, settings.duration, _Look(scene.system), about)
 
+    def series(self) -> State:
+        """The frames as one state with an axis of frames."""
+        time, points, velocities, _ = self.frames
+        net = self.scene.cloth.net
+        return jax.vmap(lambda p, v, t: State.from_points(net, p, v, time=t))(points, velocities, time)
+
     def seen(self) -> Frames:
         """The frames, ready to be drawn."""
         time, points, _, energy = self.frames
@@ -107,7 +113,7 @@ def strains(rest: np.ndarray, points: np.ndarray, triangles: np.ndarray) -> np.n
 
 
 def solid(scene: ClothScene) -> np.ndarray:
-    """Corners of the triangles that show the obstacle, or the disc that holds the drape test [m]."""
+    """Corners of the triangles that show the obstacle [m]; none without one."""
     turn = np.linspace(0, 2 * np.pi, 49)
     ring = np.stack([np.cos(turn), np.sin(turn)], axis=1)
     if isinstance(scene.obstacle, Sphere):
@@ -141,35 +147,24 @@ def cloth_job(name: str, scene: ClothScene, out: pathlib.Path, progress: Progres
         FailedError: the run failed, or the folder could not be written.
     """
     canvas_and_figure()
-    clock, run, place = Stopwatch(), ClothRun(name, scene), ResultFolder(out)
-    if resume:
-        place.take_up()
-        run.read(place.checkpoint)
-    done_before = run.done
-    try:
-        run.go_on(progress, place.checkpoint)
-        seconds = clock.seconds
-        if not bool(run.status.is_ok):
-            raise FailedError(f"the run failed: {run.status.describe(run.effects)}.")
-        frames = run.seen()
-        report = report_of(name, run, frames, seconds, done_before)
-        with place.filling(report) as folder:
-            _fill(folder, name, run, frames)
-        return Written(table(report), "report.json, cloth.obj, frames in VTK, four pictures and cloth.gif")
-    except KeyboardInterrupt:
-        if run.done == 0:
-            raise
-        raise StoppedError(f"{run.done} frames") from None
+    clock, run = Stopwatch(), ClothRun(name, scene)
+    return run.complete(out, lambda place: _finish(name, run, place, clock), progress, resume)
 
 
-def _fill(folder: pathlib.Path, name: str, run: ClothRun, frames: Frames) -> None:
-    scene = run.scene
+def _finish(name: str, run: ClothRun, place: ResultFolder, clock: Stopwatch) -> Written:
+    """Measure, and fill the folder, all or nothing."""
+    seconds, frames, series = clock.seconds, run.seen(), run.series()
+    report = report_of(name, run, frames, series, seconds)
+    with place.filling(report) as folder:
+        _fill(folder, name, run, frames, series)
+    return Written(table(report), "report.json, cloth.obj, frames in VTK, four pictures and cloth.gif")
+
+
+def _fill(folder: pathlib.Path, name: str, run: ClothRun, frames: Frames, series: State) -> None:
+    scene, net = run.scene, run.scene.cloth.net
     material = scene.cloth.fabric
     title = f"{name}: {len(scene.points)} nodes, {float(material.density):.3g} kg/m$^2$, B = {1e6 * float(material.bending[0]):.3g} µN m"
-    save_obj(folder / "cloth.obj", run.state, scene.cloth.net)
-    net = scene.cloth.net
-    moments = [State.from_points(net, p, v, time=float(t)) for t, p, v, _ in zip(*run.frames, strict=True)]
-    series = jax.tree.map(lambda *leaves: jnp.stack(leaves), *moments)
+    save_obj(folder / "cloth.obj", run.state, net)
     save_vtk(folder / "frames", series, net, triangles=frames.triangles)
     draw_strip(folder / "strip.png", frames, title)
     draw_last(folder / "last.png", frames, title)
@@ -177,10 +172,10 @@ def _fill(folder: pathlib.Path, name: str, run: ClothRun, frames: Frames) -> Non
     draw_animation(folder / "cloth.gif", frames)
 
 
-def report_of(name: str, run: ClothRun, frames: Frames, seconds: float, done_before: int) -> dict[str, Any]:
+def report_of(name: str, run: ClothRun, frames: Frames, series: State, seconds: float) -> dict[str, Any]:
     """Everything `report.json` holds."""
     scene, state = run.scene, run.state
-    simulated = float(frames.time[-1] - frames.time[done_before])
+    simulated = float(frames.time[-1] - frames.time[run.done_before])
     report: dict[str, Any] = {
         "scene": name,
         "settings": numbers_of(scene),
@@ -190,7 +185,7 @@ def report_of(name: str, run: ClothRun, frames: Frames, seconds: float, done_bef
         "time_s": frames.time.tolist(),
         "largest_strain": float(frames.strain[-1].max()),
         "largest_speed_m_per_s": float(np.linalg.norm(run.frames[2][-1], axis=1).max()),
-        "penetration_m": None if scene.obstacle is None else float(_deepest(scene, frames)),
+        "penetration_m": _deepest(scene, series),
         "warnings": run.status.describe(run.effects),
         "seconds": {"run": seconds, "per_simulated_second": seconds / simulated if simulated else None},
     }
@@ -202,13 +197,11 @@ def report_of(name: str, run: ClothRun, frames: Frames, seconds: float, done_bef
     return report
 
 
-def _deepest(scene: ClothScene, frames: Frames) -> float:
-    """How deep a node was inside the obstacle in any frame [m]; 0 where none was."""
+def _deepest(scene: ClothScene, series: State) -> float | None:
+    """How deep a node was inside the obstacle in any frame [m], 0 where none was; None without an obstacle."""
     if scene.obstacle is None:
-        return 0.0
-    net = scene.cloth.net
-    states = [State.from_points(net, points) for points in frames.points]
-    return max(0.0, *(-float(jnp.min(scene.obstacle.distance(s.position, s.time))) for s in states))
+        return None
+    return max(0.0, -float(jnp.min(jax.vmap(scene.obstacle.distance)(series.position, series.time))))
 
 
 def table(report: dict[str, Any]) -> str:

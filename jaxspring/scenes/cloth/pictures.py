@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..drawing import canvas_and_figure
+from ..drawing import new_figure
 
 DPI = 110
 N_PANELS = 6
@@ -24,9 +24,7 @@ def draw_strip(path: pathlib.Path, frames: Any, title: str) -> None:
     Raises:
         ImportError: matplotlib is not installed.
     """
-    canvas, figure_of = canvas_and_figure()
-    figure = figure_of((13, 8.4), DPI, layout="constrained")
-    canvas(figure)
+    figure = new_figure(13, 8.4, DPI)
     chosen = np.linspace(0, len(frames.time) - 1, N_PANELS).round().astype(int)
     axes = [figure.add_subplot(2, 3, i + 1, projection="3d") for i in range(N_PANELS)]
     for a, i in zip(axes, chosen, strict=True):
@@ -42,9 +40,7 @@ def draw_last(path: pathlib.Path, frames: Any, title: str) -> None:
     Raises:
         ImportError: matplotlib is not installed.
     """
-    canvas, figure_of = canvas_and_figure()
-    figure = figure_of((7.5, 6), DPI, layout="constrained")
-    canvas(figure)
+    figure = new_figure(7.5, 6, DPI)
     axes = figure.add_subplot(projection="3d")
     _panel(axes, frames, len(frames.time) - 1)
     _colour_bar(figure, [axes], frames)
@@ -58,9 +54,7 @@ def draw_energy(path: pathlib.Path, frames: Any) -> None:
     Raises:
         ImportError: matplotlib is not installed.
     """
-    canvas, figure_of = canvas_and_figure()
-    figure = figure_of((7, 4), DPI, layout="constrained")
-    canvas(figure)
+    figure = new_figure(7, 4, DPI)
     axes = figure.add_subplot()
     for name, values in frames.energy.items():
         axes.plot(frames.time, 1e3 * values, label=name)
@@ -76,11 +70,9 @@ def draw_animation(path: pathlib.Path, frames: Any) -> None:
     Raises:
         ImportError: matplotlib or pillow is not installed.
     """
-    canvas, figure_of = canvas_and_figure()
     from matplotlib.animation import FuncAnimation, PillowWriter
 
-    figure = figure_of((6, 5), 80)
-    canvas(figure)
+    figure = new_figure(6, 5, 80, layout=None)
     axes = figure.add_subplot(projection="3d")
 
     def show(i: int) -> list[Any]:

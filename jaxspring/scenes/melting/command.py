@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import pathlib
 
-from ..command import Command, Written, settings_of
+from ..command import Command, Written, add_out, out_folder, settings_of
 
 LARGEST_BLOCK = 4_096  # particles: every pair of them is looked at in every step
 
@@ -14,13 +14,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What `jaxspring melt` takes."""
     parser.add_argument("--nodes", type=block, metavar="NXxNYxNZ", help="particles of the block along x, y and z")
     parser.add_argument("--duration", type=seconds, metavar="S", help="simulated time in seconds")
-    parser.add_argument("--out", metavar="DIR", default="jaxspring-melt", help="folder for the results; an older result there is replaced")
+    add_out(parser, "jaxspring-melt")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint of an interrupted run with the same DIR")
-
-
-def folder(given: argparse.Namespace) -> pathlib.Path:
-    """Where the results go."""
-    return pathlib.Path(given.out)
 
 
 def run(given: argparse.Namespace, out: pathlib.Path) -> Written:
@@ -63,6 +58,6 @@ COMMAND = Command(
     help="melt a block on a hot plate",
     description="A block of springs on a hot plate conducts, softens, melts and spreads; writes a report, pictures and an animation.",
     add_arguments=add_arguments,
-    folder=folder,
+    folder=out_folder,
     run=run,
 )

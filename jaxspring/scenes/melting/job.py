@@ -20,7 +20,7 @@ from ...state import State
 from ...steppers.explicit import SymplecticEuler
 from ...thermal.fusing import melted_fraction
 from ...thermal.ledger import energy_ledger
-from ..command import FailedError, StoppedError, Written
+from ..command import FailedError, Written
 from ..drawing import canvas_and_figure
 from ..folder import ResultFolder
 from ..parts import PartedRun
@@ -86,24 +86,12 @@ def melt(settings: MeltSettings, out: pathlib.Path, progress: Progress | None = 
     canvas_and_figure()
     clock = Stopwatch()
     run = MeltRun(melting_block(settings), settings)
-    place = ResultFolder(out)
-    if resume:
-        place.take_up()
-        run.read(place.checkpoint)
-    try:
-        run.go_on(progress, place.checkpoint)
-        return _finish(run, place, clock)
-    except KeyboardInterrupt:
-        if run.done == 0:
-            raise
-        raise StoppedError(f"{run.done} frames") from None
+    return run.complete(out, lambda place: _finish(run, place, clock), progress, resume)
 
 
 def _finish(run: MeltRun, place: ResultFolder, clock: Stopwatch) -> Written:
     """Check, and fill the folder, all or nothing."""
     scene, settings, frames = run.scene, run.settings, run.seen()
-    if not bool(run.status.is_ok):
-        raise FailedError(f"the run failed: {run.status.describe(run.effects)}.")
     seconds = {"run": clock.seconds, **seconds_per_effect(scene, run.state)}
     report = report_of(scene, settings, run.state, frames, seconds)
     lowest = report["lowest_particle_m"]

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..drawing import canvas_and_figure
+from ..drawing import new_figure
 from .scene import MeltSettings
 
 DPI = 110
@@ -20,9 +20,7 @@ def draw_strip(path: pathlib.Path, frames: Any, settings: MeltSettings) -> None:
     Raises:
         ImportError: matplotlib is not installed.
     """
-    canvas, figure_of = canvas_and_figure()
-    figure = figure_of((13, 7.2), DPI, layout="constrained")
-    canvas(figure)
+    figure = new_figure(13, 7.2, DPI)
     chosen = np.linspace(0, len(frames.time) - 1, N_PANELS).round().astype(int)
     axes = [figure.add_subplot(2, 3, i + 1, projection="3d") for i in range(N_PANELS)]
     dots = [_panel(a, frames, int(i), settings) for a, i in zip(axes, chosen, strict=True)]
@@ -37,11 +35,9 @@ def draw_animation(path: pathlib.Path, frames: Any, settings: MeltSettings) -> N
     Raises:
         ImportError: matplotlib or pillow is not installed.
     """
-    canvas, figure_of = canvas_and_figure()
     from matplotlib.animation import FuncAnimation, PillowWriter
 
-    figure = figure_of((6, 5), 80)
-    canvas(figure)
+    figure = new_figure(6, 5, 80, layout=None)
     axes = figure.add_subplot(projection="3d")
     dots = _panel(axes, frames, 0, settings)
     figure.colorbar(dots, ax=axes, shrink=0.7, pad=0.12, label="temperature (K)")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import pathlib
 
-from ..command import Command, UnusableError, Written, number, settings_of, whole_number
+from ..command import Command, UnusableError, Written, add_out, number, out_folder, settings_of, whole_number
 
 LARGEST_DEPTH = 8
 LONGEST = 20.0  # seconds of a walk: gradients through more are lost in chaos
@@ -18,15 +18,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--body", type=body, metavar="ROWS", help="rows of cells from the top down, such as '####/#..#'")
     parser.add_argument("--duration", type=number, metavar="S", help="simulated time of a walk in seconds (2)")
     parser.add_argument("--seed", type=whole_number, metavar="N", help="of the first weights (0)")
-    parser.add_argument("--out", metavar="DIR", default="jaxspring-walk", help="folder for the results; an older result there is replaced")
+    add_out(parser, "jaxspring-walk")
     parser.add_argument(
         "--resume", action="store_true", help="go on from the checkpoint of an interrupted or finished run with the same DIR"
     )
-
-
-def folder(given: argparse.Namespace) -> pathlib.Path:
-    """Where the results go."""
-    return pathlib.Path(given.out)
 
 
 def run(given: argparse.Namespace, out: pathlib.Path) -> Written:
@@ -64,6 +59,6 @@ COMMAND = Command(
     help="train a soft robot to walk",
     description="A robot of springs learns to walk by gradients through the simulation; writes a report, pictures and an animation.",
     add_arguments=add_arguments,
-    folder=folder,
+    folder=out_folder,
     run=run,
 )

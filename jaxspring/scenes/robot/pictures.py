@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..drawing import canvas_and_figure
+from ..drawing import new_figure
 
 DPI = 110
 N_SHOWN = 6
@@ -24,9 +24,7 @@ def draw_learning(path: pathlib.Path, distances: list[float]) -> None:
     Raises:
         ImportError: matplotlib is not installed.
     """
-    canvas, figure_of = canvas_and_figure()
-    figure = figure_of((7, 4), DPI, layout="constrained")
-    canvas(figure)
+    figure = new_figure(7, 4, DPI)
     axes = figure.add_subplot()
     axes.plot(distances, color="tab:blue")
     best = int(np.argmax(distances))
@@ -43,11 +41,9 @@ def draw_walks(path: pathlib.Path, walks: dict[str, Any]) -> None:
     Raises:
         ImportError: matplotlib is not installed.
     """
-    canvas, figure_of = canvas_and_figure()
     box, scale = _box(walks), _scale(walks)
     panel = 5.6 * (box[3] - box[2]) / (box[1] - box[0])  # inches high
-    figure = figure_of((13, N_SHOWN * (panel + 0.3) + 0.6), DPI, layout="constrained")
-    canvas(figure)
+    figure = new_figure(13, N_SHOWN * (panel + 0.3) + 0.6, DPI)
     columns = figure.subplots(N_SHOWN, len(walks), sharex=True, sharey=True).T
     for column, (name, frames) in zip(columns, walks.items(), strict=True):
         for axes, i in zip(column, np.linspace(0, len(frames.time) - 1, N_SHOWN).round().astype(int), strict=True):
@@ -64,13 +60,11 @@ def draw_animation(path: pathlib.Path, walks: dict[str, Any]) -> None:
     Raises:
         ImportError: matplotlib or pillow is not installed.
     """
-    canvas, figure_of = canvas_and_figure()
     from matplotlib.animation import FuncAnimation, PillowWriter
 
     box, scale = _box(walks), _scale(walks)
     panel = 6.5 * (box[3] - box[2]) / (box[1] - box[0])  # inches high
-    figure = figure_of((8, len(walks) * (panel + 0.5) + 0.5), 80, layout="constrained")
-    canvas(figure)
+    figure = new_figure(8, len(walks) * (panel + 0.5) + 0.5, 80)
     rows = figure.subplots(len(walks), 1, sharex=True)
     _colour_bar(figure, list(rows), scale)
     duration = float(next(iter(walks.values())).time[-1])

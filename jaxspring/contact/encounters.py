@@ -14,6 +14,7 @@ Source: events in a step as in Hairer, Norsett and Wanner (1993), II.6; the numb
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import NamedTuple
 
 import jax
@@ -28,11 +29,12 @@ from .bounces import thrown
 from .passage import Passage, Way
 from .paths import Path
 from .search import first_root
-from .sliding import slide
+from .sliding import braking, slide
 from .surfaces import Flat, picked
 
 MOST = 8  # impacts followed one by one in a step
 LATE = 4  # from this one on, further bounces on the same obstacle are taken together
+SHORT = 1e-5  # of the time to an obstacle: whom friction leaves further from it slides on before it counts as met
 REFINEMENTS = 2  # differentiated steps of Newton's method: with two, second derivatives are right as well
 
 
@@ -67,7 +69,8 @@ def _leap(scene: Passage, path: Path, i: Array) -> tuple[Path, Array]:
     t = jnp.where(found.is_hit, found.time, path.left)
     is_any_held = any_lane(jnp.any(jnp.stack([jnp.any(h) for h in path.held])))
     at = lax.cond(is_any_held, lambda: slide(scene, path, t, way, bends), lambda: _flown(scene, path, t))
-    at, reaches = _refined(scene, at, path.left, way.acceleration, found)
+    slowed = way.acceleration - braking(scene, path, way, bends)
+    at, reaches = _refined(scene, at, path.left, slowed, found, i >= MOST - 2)
     is_hit = found.is_hit & reaches
     after = thrown(scene, at, way.acceleration, found.chosen, is_hit, i >= LATE)
     zero = jnp.zeros_like(path.left)
@@ -86,11 +89,12 @@ def _flown(scene: Passage, path: Path, t: Array) -> Path:
     return dataclasses.replace(path, position=x, velocity=v, arrived=v + scene.offset, left=path.left - t)
 
 
-def _refined(scene: Passage, at: Path, span: Array, pulled: Vector, found: Meeting) -> tuple[Path, Array]:
+def _refined(scene: Passage, at: Path, span: Array, pulled: Vector, found: Meeting, is_late: Array) -> tuple[Path, Array]:
     """The place and time of an impact, with their derivatives, and whether there is one in the time `span` that was left before."""
     zero, one = jnp.zeros_like(at.left), jnp.ones_like(at.left)
     hair = float(jnp.finfo(zero.dtype).eps) ** 0.5 * scene.dt
     rounding = pick(found.chosen, scene.rounding)
+    slides = functools.reduce(jnp.logical_or, at.held) & ~is_late
 
     def nearer(at: tuple[Vector, Vector, Array, Array], _: None) -> tuple[tuple[Vector, Vector, Array, Array], None]:
         x, v, left, reaches = at
@@ -99,9 +103,9 @@ def _refined(scene: Passage, at: Path, span: Array, pulled: Vector, found: Meeti
         # What is rounding counts as on the obstacle: its value is dropped, its derivative is kept.
         height = touch.height - lax.stop_gradient(jnp.where(jnp.abs(touch.height) <= rounding, touch.height, zero))
         moves = found.is_hit & ~found.is_still & (speed < 0)
-        # The search knows no friction: it may have stopped the node, or all but stopped it, on the way.
         t = jnp.where(moves, -height / jnp.where(moves, speed, one), zero)
-        is_near = (t <= left + hair) & (t >= -span)
+        # The search knows no friction: it may have stopped the node, or slowed it, on the way, and goes on doing so.
+        is_near = (t <= left + hair) & (t >= -span) & ~(slides & (t > SHORT * found.time))
         reaches = reaches & ((moves & is_near) | (height <= rounding) | found.is_still)
         t = jnp.where(is_near, t, zero)
         return (x + t * (v + (0.5 * t) * pulled), v + t * pulled, left - t, reaches), None

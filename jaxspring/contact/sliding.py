@@ -5,6 +5,7 @@
     j     = -(n . w + d_t) - t b - n . off                                  pressed in the time t, b the bend of the height
     share = min(mu j / |y - drag|, 1)                                       of the slip that friction takes; 1: the node sticks
     place = x + t (begun + t a' / 2 - share (y - drag) / 2 + share off')    then along n onto the surface, by push
+          = x + t drag + t q b / 2       where it stops, b = begun + off' - drag, in the time t q, q = |b| / (|b| + mu j - |y - drag|)
     v     = y - share (y - drag) + push / t + t (a - a') / 2 + (off - off') then moving with the surface there; share by all that pressed
 
 The push is half of what turns the velocity on a curved obstacle, the end the other half. Without friction, that keeps the energy: RATTLE.
@@ -21,7 +22,7 @@ from jax import lax
 from jaxtyping import Array
 
 from ..forces.contact import Book
-from ..forces.planes import braked
+from ..forces.planes import braked, halted
 from ..vector import Vector
 from .frames import Frame
 from .passage import Passage, Way
@@ -46,12 +47,15 @@ def slide(scene: Passage, path: Path, t: Array, way: Way, bends: tuple[Array, ..
     begun, pulled, lag = way.velocity, way.acceleration, frame.without(off)
     y = begun + t * pulled + lag
     pull, parts = _pulls(scene, _pressed(scene, path, t, way, bends))
-    slip = y - frame.carried(y)
-    for part, touch in zip(parts, way.touches, strict=True):
-        slip = slip if touch.drag is None else slip - part * frame.without(touch.drag)
+    carried = _carried(way, y, parts)
+    slip = y - carried
     share = braked(pull, slip)
     # A constant force of friction over the time t; one that stops the node also ends what the stepper's offset moves it.
     place = path.position + t * (begun + (0.5 * t) * pulled - (0.5 * share) * slip + share * lag)
+    # Where it stops before, half of the velocity at the begin, seen from the surface, lasts as long.
+    first = begun + lag - _carried(way, begun + lag, parts)
+    stopped = path.position + t * carried + (0.5 * t * halted(pull, slip, first)) * first
+    place = place.map(lambda a, b: jnp.where(share < 1, a, b), stopped)
     landed = _landed(scene, place, frame, end)
     # In a shorter time what the surface turns is none, and the rounding of a place over it would be a speed.
     goes = t > float(jnp.finfo(t.dtype).eps) ** 0.5 * scene.dt
@@ -71,6 +75,23 @@ def slide(scene: Passage, path: Path, t: Array, way: Way, bends: tuple[Array, ..
         books = _entered(scene, path, way, given, slip, [(p * share, p * lost) for p in parts])
     velocity = v - ended.without(off)
     return dataclasses.replace(path, position=landed, velocity=velocity, arrived=v, left=path.left - t, books=books)
+
+
+def braking(scene: Passage, path: Path, way: Way, bends: tuple[Array, ...]) -> Vector:
+    """By what friction slows each node that slides, and is not stopped by it [m/s^2]."""
+    pull, parts = _pulls(scene, _pressed(scene, path, scene.dt, way, bends))
+    begun = way.velocity + way.frame.without(scene.offset)
+    slip = begun - _carried(way, begun, parts)
+    speed = slip.norm()
+    return (jnp.where(speed > 0, pull / scene.dt, jnp.zeros_like(speed)) / jnp.where(speed > 0, speed, jnp.ones_like(speed))) * slip
+
+
+def _carried(way: Way, velocity: Vector, parts: list[Array]) -> Vector:
+    """What the surfaces along which a velocity goes move by themselves, each by its part of the friction [m/s]."""
+    carried = way.frame.carried(velocity)
+    for part, touch in zip(parts, way.touches, strict=True):
+        carried = carried if touch.drag is None else carried + part * way.frame.without(touch.drag)
+    return carried
 
 
 def _pressed(scene: Passage, path: Path, t: Array, way: Way, bends: tuple[Array, ...]) -> tuple[Array, ...]:
@@ -120,4 +141,4 @@ def _entered(scene: Passage, path: Path, way: Way, given: Vector, slip: Vector, 
     return tuple(after)
 
 
-__all__ = ["slide"]
+__all__ = ["braking", "slide"]

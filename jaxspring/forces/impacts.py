@@ -39,7 +39,7 @@ from jaxtyping import Array
 
 from ..numerics import any_lane
 from ..vector import Vector
-from .planes import Plane, bounces, braked, is_slow, meeting, pick, without
+from .planes import Plane, bounces, braked, halted, is_slow, meeting, pick, without
 
 MOST = 16  # impacts (with a pair of planes) followed in one step
 
@@ -143,9 +143,23 @@ class Impacts(eqx.Module):
     def strike(self, path: Path) -> tuple[Path, Array]:
         """Every node's next impact, where there is one, and whether there was any."""
         t, chosen, is_hit = self.next_impact(path)
-        after = self._thrown(self.advance(path, t), chosen, is_hit)
-        before = path if path.held else dataclasses.replace(path, held=tuple(jnp.zeros_like(c) for c in chosen))
-        return jax.tree.map(lambda new, old: jnp.where(is_hit, new, old), after, before), jnp.any(is_hit)
+        at = self.advance(path, t)
+        before, any_hit = path, jnp.any(is_hit)
+        if path.held:
+            # The search knows no friction: whom it stops short of a plane, or slows on the way there, goes on from where it is.
+            is_short = is_hit & self._falls_short(at, chosen)
+            before, is_hit = jax.tree.map(lambda new, old: jnp.where(is_short, new, old), at, path), is_hit & ~is_short
+        else:
+            before = dataclasses.replace(path, held=tuple(jnp.zeros_like(c) for c in chosen))
+        after = self._thrown(at, chosen, is_hit)
+        return jax.tree.map(lambda new, old: jnp.where(is_hit, new, old), after, before), any_hit
+
+    def _falls_short(self, at: Path, chosen: tuple[Array, ...]) -> Array:
+        """Where a node that rests on one plane is not yet on the other that it was to meet."""
+        rests, short = jnp.zeros_like(at.is_struck), jnp.zeros_like(at.is_struck)
+        for plane, base, rounding, was, c in zip(self.planes, self.base, self.rounding, at.held, chosen, strict=True):
+            rests, short = rests | was, short | (c & (plane.height(at.position) - base > rounding))
+        return rests & short
 
     def next_impact(self, path: Path) -> tuple[Array, tuple[Array, ...], Array]:
         """The time until each node meets its next plane [s], for each plane whether it is that one, and whether there is one."""
@@ -211,6 +225,9 @@ class Impacts(eqx.Module):
         share = braked(pull, along)
         # A constant force of friction over the time t; one that stops the node also ends what the stepper's offset moves it.
         slid = begun + (0.5 * t) * without(a, basis) - (0.5 * share) * along + share * slip
+        # Where it stops before, half of the true velocity at the begin lasts as long.
+        stopped = (0.5 * halted(pull, along, begun + slip)) * (begun + slip)
+        slid = slid.map(lambda a, b: jnp.where(share < 1, a, b), stopped)
         velocity = (1 - share) * along
         work, given = path.work, path.given
         if work is not None and given is not None:

@@ -110,6 +110,22 @@ def braked(pull: Array, along: Vector) -> Array:
     return jnp.where(is_sliding, jnp.minimum(pull / jnp.where(is_sliding, speed, one), one), jnp.zeros_like(speed))
 
 
+def halted(pull: Array, along: Vector, begun: Vector) -> Array:
+    """Which part of a time passes until friction of a constant force has stopped a slide; 1 where it does not.
+
+    Args:
+        pull: tangential velocity that friction can take in that time [m/s].
+        along: the velocity that the slide would have after it, without friction [m/s].
+        begun: the velocity at its begin [m/s].
+    """
+    speed, reserve = begun.norm(), pull - along.norm()
+    one, zero = jnp.ones_like(reserve), jnp.zeros_like(reserve)
+    # A speed of rounding is none: what rests stays where it is, bit by bit.
+    moves = speed > 64 * float(jnp.finfo(speed.dtype).eps) * pull
+    stops = (reserve > 0) & moves
+    return jnp.where(reserve > 0, jnp.where(stops, speed / jnp.where(stops, speed + reserve, one), zero), one)
+
+
 def pick(chosen: tuple[Array, ...], values: tuple[Array, ...]) -> Array:
     """The value of the chosen plane; one plane's alone is no choice."""
     found = values[0]
@@ -118,4 +134,4 @@ def pick(chosen: tuple[Array, ...], values: tuple[Array, ...]) -> Array:
     return found
 
 
-__all__ = ["Plane", "bounces", "braked", "counted_from", "is_slow", "meeting", "pick", "without"]
+__all__ = ["Plane", "bounces", "braked", "counted_from", "halted", "is_slow", "meeting", "pick", "without"]

@@ -110,3 +110,30 @@ def test_constants_of_a_floor_may_be_traced(dtype):
     if dtype == np.float64:
         up, down = np.asarray(values)[4:].reshape(2, 2, 6).transpose(1, 0, 2)
         np.testing.assert_allclose(slopes[:2], (up - down) / (2 * h), rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("curved", [False, True], ids=["planes", "any obstacle"])
+def test_where_a_slide_stops(curved):
+    """At v^2 / (2 mu g), within a step and over many, short of a wall or thrown back by it with e; and so its derivatives."""
+    mu, e, g, dt = 0.5, 0.5, 10.0, 0.05
+    ground = js.contact.SignedDistance(lambda x, t: x[1], reads_time=False) if curved else js.contact.Plane(GROUND, UP)
+    rules = (js.contact.Contact(ground, mu), js.contact.Contact(js.contact.Plane((0.0, 0.0), (1.0, 0.0)), 0.0, e))
+    speed = np.array([0.1, 0.1, 0.1, 0.2, 1.03, 1.03])
+    way = speed**2 / (2 * mu * g)
+    gap = way * np.array([0.5, 0.9, 1.1, 3.0, 0.7, 1.2])
+    net = js.lattice(6)
+    system = js.System(net, 1.0, js.Gravity((0.0, -g)), rules=rules)
+
+    def places(gap, speed):
+        flat = jnp.zeros_like(gap)
+        start = js.State.from_points(net, jnp.stack([gap, flat], 1), jnp.stack([-speed, flat], 1))
+        return js.rollout(system, start, js.VelocityVerlet(), dt, 8).state.points[:, 0]
+
+    stops = np.where(gap > way, gap - way, e * e * (way - gap))
+    found, pull = jax.vjp(places, gap, speed)
+    np.testing.assert_allclose(found, stops, rtol=1e-6)
+    by_gap, by_speed = pull(jnp.ones(6))
+    sign = np.where(gap > way, 1.0, -e * e)
+    np.testing.assert_allclose(by_gap, sign, rtol=1e-5)
+    np.testing.assert_allclose(by_speed, -sign * speed / (mu * g), rtol=1e-5)

@@ -130,7 +130,10 @@ PUBLIC: dict[str, dict[str, tuple[str, ...]]] = {
             "gradient_magnitude",
             "principal_curvatures",
         ),
-        "images.files": ("Channel", "ImageError", "Luminance", "elevation_model", "image_from_array"),
+        "images.files": ("ImageError", "elevation_model", "image_from_array"),
+        "images.channels": ("Channel", "Luminance", "TerrainRGB", "Terrarium"),
+        "images.holes": ("Holes",),
+        "images.maps": ("Map", "load_map"),
     },
     "inverse": {
         "inverse.fit": ("History", "Iteration"),

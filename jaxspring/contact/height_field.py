@@ -49,9 +49,9 @@ class HeightField(Obstacle):
     sampling: Sampling
 
     def __init__(self, image: Image, sampling: Sampling | None = None):
-        self.image = kind("image", image, Image, "Image(heights, spacing=0.1)")
-        without_holes("image", self.image, "a ground must be somewhere at every place.")
-        finite("image.values", image.values)
+        image = kind("image", image, Image, "Image(heights, spacing=0.1)")
+        self.image = without_holes("image", image, "a ground must be somewhere at every place.")
+        finite("image.values", self.image.values)
         self.sampling = CubicSpline() if sampling is None else kind("sampling", sampling, Sampling, "CubicSpline()")
 
     def distance(self, position: Vector, time: Array) -> Array:

@@ -114,10 +114,9 @@ class DataSprings(Force):
 
     def invalid(self) -> Array:
         """Whether the stiffness or a weight is negative or not finite, or the image's spacing not positive."""
-        weights = (
-            self.image.weights if isinstance(self.image, Image) else None if self.image.cover is None else self.image.cover.coefficients
-        )
-        return any_refused(self.stiffness, *(() if weights is None else (weights,))) | any_not_positive(self.image.spacing)
+        cover = _surface(self).cover
+        refused = any_refused(self.stiffness) if cover is None else any_refused(self.stiffness, cover.coefficients)
+        return refused | any_not_positive(self.image.spacing)
 
     def _stiffness(self, state: State) -> Array:
         stiffness, cover = state.layout.constant("stiffness", self.stiffness), _surface(self).cover

@@ -16,7 +16,7 @@ import numpy as np
 from jax.core import Tracer
 from numpy.typing import ArrayLike
 
-from .channels import Channel, Luminance, OneChannel, Pixels
+from .channels import OneChannel, Pixels
 from .holes import Holes
 from .image import Image, PerAxis
 from .numpy_files import read_npy, read_npz

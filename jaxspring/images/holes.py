@@ -14,9 +14,11 @@ Source of the pyramid: Gortler et al. (1996), "The Lumigraph", section 3.4 (pull
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -97,11 +99,18 @@ def continued(values: Any, weights: Any) -> Any:
     What `values` holds under a hole is not read: it may be NaN, and the derivative with respect to it is zero. Where every weight is zero
     the result is zero.
     """
-    xp: Any = np if is_concrete(values) and is_concrete(weights) else jnp
-    if xp is np:
-        values, weights = np.asarray(values), np.asarray(weights)
+    if not (is_concrete(values) and is_concrete(weights)):
+        return _traced(values, weights)
+    return _continued(np, np.asarray(values), np.asarray(weights))
+
+
+def _continued(xp: Any, values: Any, weights: Any) -> Any:
     known = weights > 0
     return _filled(xp, xp.where(known, values, xp.zeros_like(values)), known.astype(values.dtype))
+
+
+# One program instead of hundreds of operations where it stands outside `jit`; inside, it leaves no trace.
+_traced = functools.partial(jax.jit, inline=True)(functools.partial(_continued, jnp))
 
 
 def _filled(xp: Any, values: Any, known: Any) -> Any:

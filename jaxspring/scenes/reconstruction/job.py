@@ -153,7 +153,9 @@ class _Bar:
 def mesh_arrays(found: Reconstructed) -> dict[str, np.ndarray]:
     """The fitted mesh: `points` (N, 3) with the best heights, `z_sampled` (N,), `triangles` (T, 3), `edges` (E, 2), `stiffness` (E,) [N/m].
 
-    Of an image with weights also `unreached` (N,): nodes whose heights come from their neighbours. x and y are in the unit of the image's spacing (pixels for the command), z in that of its values.
+    Of an image with weights also `unreached` (N,): nodes whose heights come from their neighbours.
+
+    x and y are in the unit of the image's spacing (pixels for the command), z in that of its values.
     """
     mesh, net = found.fitted, found.scene.net
     points = np.stack([np.ravel(a) for a in (mesh.x, mesh.y, mesh.z_best)], axis=-1).astype(np.float64)

@@ -132,7 +132,7 @@ class SurfaceError(eqx.Module):
 
 
 def mean_error(scene: Reconstruction, error: Array) -> Array:
-    """Mean over all pixels, by their weights, of squared errors summed per triangle, floored so that its logarithm is finite [image range^2]."""
+    """Mean over the pixels, by their weights, of errors squared and summed per triangle, floored for its logarithm [image range^2]."""
     return jnp.maximum(jnp.sum(error) / scene.grid.total, _SMALLEST_ERROR)
 
 

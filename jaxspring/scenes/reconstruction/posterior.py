@@ -13,7 +13,8 @@ and B_j between rows j and j + 1, and both the solution and the diagonal of the 
 
 in time ny nx^3 and memory ny nx^2, where the inverse itself would take (ny nx)^2.
 
-Source: Rasmussen & Williams (2006), "Gaussian Processes for Machine Learning", section 2.1; the sweeps: Rybicki & Hummer (1991), appendix B.
+Source: Rasmussen & Williams (2006), "Gaussian Processes for Machine Learning", section 2.1;
+the sweeps: Rybicki & Hummer (1991), appendix B.
 """
 
 from __future__ import annotations
@@ -65,17 +66,17 @@ def rows(equations: NormalEquations, ratio: Array | float) -> Rows:
             zero = jnp.zeros_like(aa)
             diagonal = diagonal.at[place].add(jnp.where(step == 0, entries[p][q], zero))
             below = below.at[place].add(jnp.where(step == 1, entries[p][q], zero))
+    along, across, alone = _chain(nx), np.diag(_chain(ny))[:, None, None], np.eye(nx)[None]
+    membrane = jnp.asarray(along[None] + across * alone, aa.dtype)
+    joined = jnp.asarray((np.arange(ny) < ny - 1)[:, None, None] * alone, aa.dtype)
     ratio = jnp.asarray(ratio, aa.dtype)
-    along, across = (_chain(n).astype(aa.dtype) for n in (nx, ny))
-    diagonal = diagonal + ratio * (along + jnp.diagonal(across)[:, None, None] * np.eye(nx, dtype=aa.dtype))
-    joined = (jnp.arange(ny) < ny - 1).astype(aa.dtype)[:, None, None]
-    return Rows(diagonal, below - ratio * joined * np.eye(nx, dtype=aa.dtype))
+    return Rows(diagonal + ratio * membrane, below - ratio * joined)
 
 
 @jax.jit
 def solve_rows(matrix: Rows, right_side: Node) -> tuple[Node, Node]:
     """Solution, and diagonal of the inverse, in node shape."""
-    ny, nx = right_side.shape
+    nx = right_side.shape[1]
     identity = jnp.eye(nx, dtype=right_side.dtype)
 
     def down(before: tuple[Array, Array], row: tuple[Array, Array, Array]) -> tuple[tuple[Array, Array], tuple[Array, Array, Array]]:

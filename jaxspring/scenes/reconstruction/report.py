@@ -4,8 +4,8 @@ Two rules for the heights, never compared with each other: `sampled` takes the i
 the mesh. The reference is the bilinear spline on the regular grid with as many nodes: the stricter one, as the same nodes joined by
 triangles do worse.
 
-Errors are taken from the drawn surface, pixel by pixel in double precision, not from the sums that the fit uses. Where pixels have weights w
-they are sqrt(sum w e^2 / sum w): over the pixels that have data, where the weights are ones and zeros.
+Errors are taken from the drawn surface, pixel by pixel in double precision, not from the sums that the fit uses. Where pixels have
+weights w they are sqrt(sum w e^2 / sum w): over the pixels that have data, where the weights are ones and zeros.
 
 With holes the best heights are solved exactly: the error of an iterative solve hides where only the weak springs along z hold a node.
 """
@@ -101,11 +101,11 @@ def _weighted_spline(rows: np.ndarray, columns: np.ndarray, truth: np.ndarray, w
 
     (_, ny), (_, nx) = rows.shape, columns.shape
     hats = sparse.kron(sparse.csr_array(rows), sparse.csr_array(columns)).tocsr()
-    apart = [sparse.diags_array([-1.0, 1.0], offsets=[0, 1], shape=(n - 1, n)) for n in (ny, nx)]
+    apart = [sparse.eye_array(n - 1, n, k=1) - sparse.eye_array(n - 1, n) for n in (ny, nx)]
     laplacian = sparse.kron(apart[0].T @ apart[0], sparse.eye_array(nx)) + sparse.kron(sparse.eye_array(ny), apart[1].T @ apart[1])
     w = weights.ravel()
     matrix = hats.T @ (w[:, None] * hats) + MEMBRANE * w.sum() / (ny * nx) * laplacian
-    return spsolve(sparse.csc_array(matrix), hats.T @ (w * truth.ravel())).reshape(ny, nx)
+    return np.asarray(spsolve(sparse.csc_array(matrix), hats.T @ (w * truth.ravel()))).reshape(ny, nx)
 
 
 @eqx.filter_jit
@@ -140,8 +140,8 @@ def _host(mask: jax.Array | None) -> np.ndarray | None:
 
 def rms(difference: np.ndarray, weights: jax.Array | None) -> float:
     """Root mean square of a difference `(ny, nx)`, by the weights of the pixels."""
-    weights = None if weights is None else np.asarray(weights, np.float64)
-    return float(np.sqrt(np.average(difference**2, weights=weights)))
+    of_pixel = None if weights is None else np.asarray(weights, np.float64)
+    return float(np.sqrt(np.average(difference**2, weights=of_pixel)))
 
 
 def _hats(n_nodes: int, n_pixels: int) -> np.ndarray:

@@ -134,6 +134,8 @@ PUBLIC: dict[str, dict[str, tuple[str, ...]]] = {
         "images.channels": ("Channel", "Luminance", "TerrainRGB", "Terrarium"),
         "images.holes": ("Holes",),
         "images.maps": ("Map", "load_map"),
+        "images.points": ("PointCloud",),
+        "images.point_files": ("load_points",),
     },
     "inverse": {
         "inverse.fit": ("History", "Iteration"),
@@ -166,6 +168,7 @@ PUBLIC: dict[str, dict[str, tuple[str, ...]]] = {
         "scenes.reconstruction.pixels": ("PixelSprings",),
         "scenes.reconstruction.fitting": ("Reconstructed", "SpringSettings", "fit_springs"),
         "scenes.reconstruction.constants": ("ConstantsSettings", "fit_constants"),
+        "scenes.reconstruction.points": ("PointSettings", "PointSurface", "fit_points", "point_heights"),
     },
     "robot": {
         "forces.actuation": ("Actuation",),

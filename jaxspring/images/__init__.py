@@ -31,6 +31,8 @@ if TYPE_CHECKING:  # written by `python -m tests.face`
     from .holes import Holes as Holes
     from .maps import Map as Map
     from .maps import load_map as load_map
+    from .points import PointCloud as PointCloud
+    from .point_files import load_points as load_points
     from .image import Image as Image
     from .files import load_image as load_image
 else:

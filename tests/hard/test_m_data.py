@@ -65,3 +65,35 @@ def test_m2_nodata_on_the_border_is_never_a_height(tmp_path, rng):
     # Where only the declared number is a hole, NaN is an error still.
     with pytest.raises(js.images.ImageError, match="is nan in float32"):
         js.load_image(tmp_path / "dem.tif", holes=Holes())
+
+
+def test_m6_points_outside_repeated_collinear_and_far(rng):
+    """Outside the outline: counted, not used. Repeated: counted. Collinear: refused. At 5e6 m as at the origin."""
+    points = np.column_stack([rng.uniform(0, 10, (400, 2)), rng.normal(size=400)]).astype(np.float64)
+    points[:4, :2] = [[0, 0], [10, 0], [0, 10], [10, 10]]
+    x, y = np.meshgrid(np.linspace(0, 10, 4), np.linspace(0, 8, 4))
+    near = js.images.PointCloud(points)
+    far = js.images.PointCloud(points + np.array([5e6, 5e6, 0]))
+    assert far.corner == (5e6, 5e6)
+    surfaces = [js.reconstruction.point_heights(cloud, x, y) for cloud in (near, far)]
+    np.testing.assert_allclose(surfaces[1].z, surfaces[0].z, atol=1e-7)
+    assert surfaces[0].n_outside == (points[:, 1] > 8).sum()
+    assert np.isnan(surfaces[0].residual).sum() == surfaces[0].n_outside
+    assert near.n_repeated == 0
+    assert js.images.PointCloud(np.concatenate([points, points])).n_repeated == 400
+    line = np.column_stack([np.arange(9.0), 2 * np.arange(9.0) + 5e6, np.zeros(9)])
+    for bad, message in [
+        (line, "9 points lie in one place or on one line"),
+        (points[:1], "lie in one place"),
+        (np.zeros((0, 3)), "points is empty"),
+        (np.where(np.arange(400)[:, None] == 7, np.nan, points), r"points\[7\] has x = nan \(1 of 400"),
+        (points[:, :2], r"expected \(P, 3\)"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            js.images.PointCloud(bad)
+    holed = np.where(np.arange(400)[:, None] % 50 == 7, np.nan, points)
+    assert js.images.PointCloud(holed, skip_nan=True).n_skipped == 8
+    with pytest.raises(ValueError, match="none of the 400 points is within the mesh"):
+        js.reconstruction.point_heights(near, x + 5e6, y)
+    with pytest.raises(ValueError, match=r"weights\[3\] = 0.0"):
+        js.images.PointCloud(points, np.where(np.arange(400) == 3, 0.0, 1.0))

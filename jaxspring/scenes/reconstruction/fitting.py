@@ -51,8 +51,8 @@ class SpringSettings:
         k_min, k_max: of the slides' law that the fit starts from [N/m]; only their ratio matters.
         sigma: width of the law's Gaussian, in distances between nodes.
         weight: share of the least-squares rule in the loss.
-        membrane: stiffness of the springs along z over that of all pixels' springs that a node has on average. A node at the brim of a hole,
-            held by a few pixels at the far ends of its triangles, takes up their noise times up to 1 / sqrt(4 membrane pixels per node):
+        membrane: stiffness of the springs along z over that of all pixels' springs that a node has on average. A node at a hole,
+            held by few pixels at the far ends of its triangles, takes up their noise times up to 1 / sqrt(4 membrane pixels per node):
             raise it, to 1e-3 or 1e-2, where data are noisy and full of holes.
         relaxation: the rollout of each iteration.
     """

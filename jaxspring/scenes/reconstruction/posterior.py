@@ -57,15 +57,12 @@ def rows(equations: NormalEquations, ratio: Array | float) -> Rows:
     ny, nx = (n + 1 for n in equations.flip.shape)
     index = jnp.arange(ny * nx, dtype=jnp.int32).reshape(ny, nx)
     of_row, of_column = corners(index // nx, equations.flip), corners(index % nx, equations.flip)
-    entries = ((aa, ab, ca), (ab, bb, bc), (ca, bc, cc))
-    diagonal = below = jnp.zeros((ny, nx, nx), aa.dtype)
-    for p in range(3):
-        for q in range(3):
-            step = of_row[q] - of_row[p]
-            place = of_row[p], of_column[p], of_column[q]
-            zero = jnp.zeros_like(aa)
-            diagonal = diagonal.at[place].add(jnp.where(step == 0, entries[p][q], zero))
-            below = below.at[place].add(jnp.where(step == 1, entries[p][q], zero))
+    entries = jnp.stack([aa, ab, ca, ab, bb, bc, ca, bc, cc])
+    first, second = np.repeat(np.arange(3), 3), np.tile(np.arange(3), 3)
+    of_row, of_column = jnp.stack(of_row), jnp.stack(of_column)
+    place, step = (of_row[first], of_column[first], of_column[second]), of_row[second] - of_row[first]
+    empty = jnp.zeros((ny, nx, nx), aa.dtype)
+    diagonal, below = (empty.at[place].add(jnp.where(step == apart, entries, 0)) for apart in (0, 1))
     along, across, alone = _chain(nx), np.diag(_chain(ny))[:, None, None], np.eye(nx)[None]
     membrane = jnp.asarray(along[None] + across * alone, aa.dtype)
     joined = jnp.asarray((np.arange(ny) < ny - 1)[:, None, None] * alone, aa.dtype)

@@ -7,7 +7,8 @@ With b the three weights of point p in its triangle, e = b'z - z_p its residual 
 
 so a far point pulls with a constant force, whatever its distance. The minimum is found by reweighted least squares: springs of weight
 w min(1, delta / |e|), solved exactly (`posterior.py`), until the heights stand still. Derivatives are those of the minimum, by one Newton
-step with the second derivative of the energy: implicit, at the cost of one more solve.
+step with the second derivative of the energy: implicit, at the cost of one more solve. Between the places where a residual is delta the
+energy is quadratic, so that this step also ends what reweighting, which is slow near the end, has begun.
 
 Source: Huber (1964), "Robust estimation of a location parameter"; Holland & Welsch (1977) for the reweighting.
 """
@@ -50,7 +51,7 @@ class Loss(NamedTuple):
     unreached: Array
     n_lost: Array
     n_done: Array
-    change: Array
+    n_crossed: Array
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,7 @@ class PointSurface:
         n_outside: points outside the mesh, which were not used.
         variance: (ny, nx) of the heights, over that of the noise of a point of weight 1.
         n_reweightings: solves that the loss took; 0 for least squares.
-        is_settled: whether the heights stood still at the end.
+        is_settled: whether this is the minimum: the last step, exact where no residual crosses `huber`, took none across.
         mesh: the fit that the mesh is from, or None.
     """
 
@@ -208,7 +209,7 @@ def point_heights(
         n_outside=cloud.n_points - n_inside,
         variance=np.asarray(found.variance, np.float64),
         n_reweightings=int(found.n_done),
-        is_settled=bool(found.change <= _tolerance(x.dtype)),
+        is_settled=int(found.n_crossed) == 0,
     )
 
 
@@ -258,18 +259,18 @@ def best_of_points(grid: PixelGrid, values: Array, x: Node, y: Node, flip: Flip,
     problem = _Problem(grid, weights, values, location.triangle, x, y, flip, membrane * jnp.sum(weights) / x.size, delta)
     if delta is None:
         z, variance = exact_height(problem.equations(jnp.ones_like(values)), problem.ratio)
-        n_done, change = jnp.zeros((), jnp.int32), jnp.zeros((), x.dtype)
+        n_done = n_crossed = jnp.zeros((), jnp.int32)
     else:
-        z, n_done, change = _reweighted(stopped(problem))
-        z, variance = _with_derivatives(problem, delta, z)
+        start, n_done = _reweighted(stopped(problem))
+        z, variance, n_crossed = _with_derivatives(problem, delta, start)
     error = problem.residual(z)
     share = problem.share(error)
     unreached = problem.equations(share).diagonal() < problem.ratio
-    return Loss(z, variance, error, share, unreached, location.n_lost, n_done, change)
+    return Loss(z, variance, error, share, unreached, location.n_lost, n_done, n_crossed)
 
 
-def _reweighted(problem: _Problem) -> tuple[Node, Array, Array]:
-    """Heights that stand still under reweighting, from least squares on; how many solves it took; and the last change."""
+def _reweighted(problem: _Problem) -> tuple[Node, Array]:
+    """Heights that all but stand still under reweighting, from least squares on; and how many solves it took."""
     dtype = problem.x.dtype
     tolerance = _tolerance(dtype)
 
@@ -280,12 +281,14 @@ def _reweighted(problem: _Problem) -> tuple[Node, Array, Array]:
 
     far = jnp.asarray(jnp.finfo(dtype).max, dtype)
     first = jnp.full_like(problem.x, far), jnp.ones_like(problem.values), jnp.zeros((), jnp.int32), far
-    z, _, n_done, change = lax.while_loop(lambda c: (c[3] > tolerance) & (c[2] < MOST_REWEIGHTINGS), step, first)
-    return z, n_done, change
+    z, _, n_done, _ = lax.while_loop(lambda c: (c[3] > tolerance) & (c[2] < MOST_REWEIGHTINGS), step, first)
+    return z, n_done
 
 
-def _with_derivatives(problem: _Problem, delta: Array, z: Node) -> tuple[Node, Node]:
-    """The same heights, with the derivatives of the minimum; and the diagonal of the inverse by the weights that the loss left."""
+def _with_derivatives(problem: _Problem, delta: Array, z: Node) -> tuple[Node, Node, Array]:
+    """The heights after Newton's step, with the derivatives of the minimum; the diagonal of the inverse by the weights that the loss left;
+    and how many residuals the step took across delta. The energy is quadratic in between: where there are none, this is its minimum.
+    """
     error = problem.residual(z)
     left = problem.equations(problem.share(error))
     matrix = rows(left, problem.ratio)
@@ -295,7 +298,10 @@ def _with_derivatives(problem: _Problem, delta: Array, z: Node) -> tuple[Node, N
     # Both matrices in one program.
     pair = jax.tree.map(lambda *a: jnp.stack(a), stopped(rows(curved, problem.ratio)), matrix)
     solved, variance = jax.vmap(solve_rows)(pair, jnp.stack([force, left.right_side]))
-    return z - solved[0], variance[1]
+    after = z - solved[0]
+    size, before = jnp.abs(problem.residual(after)), jnp.abs(error)
+    crossed = ((size > delta) != (before > delta)) & (jnp.abs(size - delta) > _tolerance(z.dtype))
+    return after, variance[1], jnp.sum(crossed, dtype=jnp.int32)
 
 
 def _applied(matrix: Rows, z: Node) -> Node:
@@ -309,7 +315,7 @@ def _applied(matrix: Rows, z: Node) -> Node:
 
 
 def _tolerance(dtype: jnp.dtype) -> float:
-    """Change of the heights, in units of the points' range, below which they stand still: the Newton step does the rest."""
+    """Change of the heights, in units of the points' range, below which reweighting ends."""
     return 1e-7 if dtype == jnp.float64 else 1e-5
 
 

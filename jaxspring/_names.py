@@ -169,6 +169,7 @@ PUBLIC: dict[str, dict[str, tuple[str, ...]]] = {
         "scenes.reconstruction.fitting": ("Reconstructed", "SpringSettings", "fit_springs"),
         "scenes.reconstruction.constants": ("ConstantsSettings", "fit_constants"),
         "scenes.reconstruction.points": ("PointSettings", "PointSurface", "fit_points", "point_heights"),
+        "scenes.reconstruction.ground": ("Ground", "GroundSettings", "ground_of_points"),
     },
     "robot": {
         "forces.actuation": ("Actuation",),

@@ -13,7 +13,7 @@ import scipy.optimize
 import jaxspring as js
 from jaxspring.images import PointCloud, load_points
 from jaxspring.reconstruction import point_heights
-from jaxspring.scenes.reconstruction.points import best_of_points
+from jaxspring.scenes.reconstruction.points import best_of_points, places_of
 from jaxspring.scenes.reconstruction.raster import PixelGrid
 
 NODES = (5, 6)
@@ -107,6 +107,7 @@ def test_heights_have_the_derivatives_of_the_minimum(problem):
     cloud, flip = problem.cloud, jnp.asarray(problem.flip)
     extent = float(jnp.ptp(cloud.z))
     values = (cloud.z - jnp.min(cloud.z)) / extent
+    start = places_of(cloud, jnp.asarray(problem.x), jnp.asarray(problem.y))[2]
     rng = np.random.default_rng(8)
     turns = [jnp.asarray(rng.normal(size=a.shape)) for a in (values, values, problem.x, problem.z[: NODES[0] * NODES[1]].reshape(NODES))]
 
@@ -115,7 +116,7 @@ def test_heights_have_the_derivatives_of_the_minimum(problem):
     def looked_at(t):
         grid = PixelGrid(cloud.x, cloud.y, (1, N), cloud.weights + t * 0.1 * turns[1])
         x = jnp.asarray(problem.x).at[1:-1, 1:-1].add(t * turns[2][1:-1, 1:-1])
-        found = best_of_points(grid, values + t * turns[0], x, jnp.asarray(problem.y), flip, jnp.asarray(1e-3), jnp.asarray(0.02))
+        found = best_of_points(grid, values + t * turns[0], start, x, jnp.asarray(problem.y), flip, jnp.asarray(1e-3), jnp.asarray(0.02))
         return jnp.sum(found.z * turns[3])
 
     h, (_, slope) = 1e-6, looked_at(0.0)

@@ -186,15 +186,11 @@ def point_heights(
             positive(name, value, "Without it nothing holds a node that no point reaches." if name == "membrane" else "It is a residual.")
     if int(folds := count_folds(x, y, flip)):
         raise ValueError(f"{int(folds)} triangles of the mesh are folded over or have no area: points would be in several. Relax it.")
-    inside = _within(cloud, x, y)
-    n_inside = int(inside.sum())
-    if not n_inside:
-        raise ValueError(f"none of the {cloud.n_points} points is within the mesh. Give x and y from the cloud's corner, {cloud.corner}.")
+    inside, grid, start = places_of(cloud, x, y)
     low, extent = float(jnp.min(cloud.z)), float(jnp.ptp(cloud.z)) or 1.0
     delta = None if huber is None else jnp.asarray(huber / extent, x.dtype)
-    chosen = jnp.asarray(np.flatnonzero(inside))
-    grid, values = _grid(cloud, chosen), (cloud.z[chosen] - low) / extent
-    found = best_of_points(grid, values, x, y, flip, jnp.asarray(membrane, x.dtype), delta)
+    values = (cloud.z[jnp.asarray(np.flatnonzero(inside))] - low) / extent
+    found = best_of_points(grid, values, start, x, y, flip, jnp.asarray(membrane, x.dtype), delta)
     residual, share = np.full(cloud.n_points, np.nan), np.zeros(cloud.n_points)
     residual[inside], share[inside] = extent * np.asarray(found.residual), np.asarray(found.share)
     return PointSurface(
@@ -206,7 +202,7 @@ def point_heights(
         unreached=np.asarray(found.unreached),
         residual=residual,
         share=share,
-        n_outside=cloud.n_points - n_inside,
+        n_outside=cloud.n_points - int(inside.sum()),
         variance=np.asarray(found.variance, np.float64),
         n_reweightings=int(found.n_done),
         is_settled=int(found.n_crossed) == 0,
@@ -242,27 +238,30 @@ class _Problem(eqx.Module):
 
 
 @eqx.filter_jit
-def best_of_points(grid: PixelGrid, values: Array, x: Node, y: Node, flip: Flip, membrane: Array, delta: Array | None) -> Loss:
+def best_of_points(
+    grid: PixelGrid, values: Array, start: Array, x: Node, y: Node, flip: Flip, membrane: Array, delta: Array | None
+) -> Loss:
     """The heights that minimise the energy, for values in [0, 1] or so; differentiable in values, weights, x and y.
 
     Args:
         grid: the points' places and weights, all within the mesh.
         values: (P,) their heights.
+        start: (P,) triangles that the search for each point begins in.
         x: (ny, nx) of the nodes.
         y: (ny, nx) of the nodes.
         flip: diagonals.
         membrane: as in `point_heights`.
         delta: of Huber's loss, in the unit of the values; None for least squares.
     """
-    location = locate(x, y, flip, grid, _start(grid, x, y))
+    location = locate(x, y, flip, grid, start)
     weights = jnp.ones_like(values) if grid.weights is None else grid.weights
     problem = _Problem(grid, weights, values, location.triangle, x, y, flip, membrane * jnp.sum(weights) / x.size, delta)
     if delta is None:
         z, variance = exact_height(problem.equations(jnp.ones_like(values)), problem.ratio)
         n_done = n_crossed = jnp.zeros((), jnp.int32)
     else:
-        start, n_done = _reweighted(stopped(problem))
-        z, variance, n_crossed = _with_derivatives(problem, delta, start)
+        settled, n_done = _reweighted(stopped(problem))
+        z, variance, n_crossed = _with_derivatives(problem, delta, settled)
     error = problem.residual(z)
     share = problem.share(error)
     unreached = problem.equations(share).diagonal() < problem.ratio
@@ -319,21 +318,20 @@ def _tolerance(dtype: jnp.dtype) -> float:
     return 1e-7 if dtype == jnp.float64 else 1e-5
 
 
-def _within(cloud: PointCloud, x: Array, y: Array) -> np.ndarray:
-    """Which points are within the rectangle that the mesh covers, its border included."""
+def places_of(cloud: PointCloud, x: Array, y: Array) -> tuple[np.ndarray, PixelGrid, Array]:
+    """Which points are within the rectangle that the mesh covers, its border included; those, in the place of pixels in one row; and the
+    triangle where the search for each begins, that of the even lattice over the same rectangle.
+
+    Raises:
+        ValueError: no point is.
+    """
     px, py, nodes_x, nodes_y = (np.asarray(a) for a in (cloud.x, cloud.y, x, y))
-    return (px >= nodes_x.min()) & (px <= nodes_x.max()) & (py >= nodes_y.min()) & (py <= nodes_y.max())
-
-
-def _grid(cloud: PointCloud, chosen: Array) -> PixelGrid:
-    """The points in the place of pixels, in one row."""
+    west, east, south, north = nodes_x.min(), nodes_x.max(), nodes_y.min(), nodes_y.max()
+    inside = (px >= west) & (px <= east) & (py >= south) & (py <= north)
+    if not inside.any():
+        raise ValueError(f"none of the {cloud.n_points} points is within the mesh. Give x and y from the cloud's corner, {cloud.corner}.")
+    (ny, nx), chosen = x.shape, jnp.asarray(np.flatnonzero(inside))
+    column = np.clip((px[inside] - west) / (east - west) * (nx - 1), 0, nx - 2).astype(np.int32)
+    row = np.clip((py[inside] - south) / (north - south) * (ny - 1), 0, ny - 2).astype(np.int32)
     weights = None if cloud.weights is None else cloud.weights[chosen]
-    return PixelGrid(cloud.x[chosen], cloud.y[chosen], (1, chosen.size), weights)
-
-
-def _start(grid: PixelGrid, x: Node, y: Node) -> Array:
-    """(P,) triangles where the walks start: those of the even lattice over the same rectangle."""
-    ny, nx = x.shape
-    column = jnp.clip((grid.x - x[0, 0]) / (x[-1, -1] - x[0, 0]) * (nx - 1), 0, nx - 2).astype(jnp.int32)
-    row = jnp.clip((grid.y - y[0, 0]) / (y[-1, -1] - y[0, 0]) * (ny - 1), 0, ny - 2).astype(jnp.int32)
-    return lax.stop_gradient(row * (nx - 1) + column)
+    return inside, PixelGrid(cloud.x[chosen], cloud.y[chosen], (1, chosen.size), weights), jnp.asarray(row * (nx - 1) + column)

@@ -240,10 +240,10 @@ def _even(cloud: PointCloud, resolution: float) -> tuple[Array, Array]:
 
 def _floors(x: Array, y: Array, px: Array, py: Array, z: Array) -> np.ndarray:
     """(ny, nx) the highest -z of the points whose nearest node this is; minus infinity where there is none."""
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     nodes = np.column_stack([np.ravel(x), np.ravel(y)])
-    _, nearest = cKDTree(nodes).query(np.column_stack([px, py]))
+    _, nearest = KDTree(nodes).query(np.column_stack([px, py]))
     floor = np.full(len(nodes), -np.inf)
     np.maximum.at(floor, nearest, -np.asarray(z, np.float64))
     return floor.reshape(x.shape)

@@ -63,7 +63,7 @@ def image_from_array(
         TypeError: traced pixels, or pixels of a type that `Image` refuses.
 
     >>> import numpy as np
-    >>> print(image_from_array(np.ones((2, 2, 3)), Luminance()).values[0])
+    >>> print(image_from_array(np.ones((2, 2, 3)), js.images.Luminance()).values[0])
     [1. 1.]
     """
     if isinstance(pixels, Tracer):

@@ -29,7 +29,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from ..._checks import positive
+from ..._checks import as_inexact, positive
 from ...images.points import PointCloud
 from .points import places_of
 from .raster import draw, locate
@@ -123,7 +123,7 @@ def ground_of_points(
         ValueError: a mesh of fewer than 3 x 3 nodes, or folded; no point in it.
     """
     settings = GroundSettings() if settings is None else settings
-    x, y = _even(cloud, settings.resolution) if mesh is None else (jnp.asarray(a, cloud.z.dtype) for a in mesh)
+    x, y = _even(cloud, settings.resolution) if mesh is None else (as_inexact("mesh", a, cloud.z.dtype) for a in mesh)
     if x.ndim != 2 or min(x.shape) < 3 or y.shape != x.shape:
         raise ValueError(f"mesh has x of shape {x.shape} and y of shape {y.shape}; a cloth needs one shape (ny, nx), 3 x 3 at least.")
     flip = jnp.zeros((x.shape[0] - 1, x.shape[1] - 1), bool)

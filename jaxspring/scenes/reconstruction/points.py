@@ -26,7 +26,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from ..._checks import has_shape, positive
+from ..._arrays import as_mask
+from ..._checks import as_inexact, finite, has_shape, positive
 from ...images.points import PointCloud
 from ...inverse.fit import Iteration
 from ...numerics import stopped
@@ -174,13 +175,15 @@ def point_heights(
     Raises:
         ValueError: shapes that do not fit, a folded mesh, a huber or membrane that is not positive, no point within the mesh.
     """
-    x, y = (jnp.asarray(a, cloud.z.dtype) for a in (x, y))
+    x, y = as_inexact("x", x, cloud.z.dtype), as_inexact("y", y, cloud.z.dtype)
     if x.ndim != 2 or min(x.shape) < 2 or x.shape[1] > LONGEST_ROW:
         raise ValueError(f"x has shape {x.shape}; expected (ny, nx), at least 2 each and nx at most {LONGEST_ROW}.")
     has_shape("y", y, {"as x": x.shape})
     cells = x.shape[0] - 1, x.shape[1] - 1
-    flip = jnp.zeros(cells, bool) if flip is None else jnp.asarray(flip)
+    flip = jnp.zeros(cells, bool) if flip is None else jnp.asarray(as_mask("flip", flip, ", one per cell"))
     has_shape("flip", flip, {"one per cell": cells})
+    finite("x", x)
+    finite("y", y)
     for name, value in (("huber", huber), ("membrane", membrane)):
         if value is not None:
             positive(name, value, "Without it nothing holds a node that no point reaches." if name == "membrane" else "It is a residual.")

@@ -9,9 +9,8 @@ import jaxspring as js
 from jaxspring.images import Holes, image_from_array
 from jaxspring.images.holes import continued
 from jaxspring.linalg.cg import JaxCG
+from jaxspring.scenes.reconstruction.fitting import _variance
 from jaxspring.scenes.reconstruction.loss import SurfaceError, begin
-from jaxspring.scenes.reconstruction.pixels import Moments
-from jaxspring.scenes.reconstruction.posterior import exact_height
 from jaxspring.scenes.reconstruction.raster import draw, locate
 from jaxspring.scenes.reconstruction.report import measure, uniform_errors
 
@@ -80,7 +79,8 @@ def test_an_image_reads_nothing_from_holes(rng):
     for image in images[1:]:
         np.testing.assert_array_equal(image.values, images[0].values)
     assert (images[0].n_holes, js.Image(values).n_holes) == (3, 0)
-    slope = jax.grad(lambda v: jnp.sum(js.Image(v, weights=weights).normalised().values ** 2))(jnp.asarray(np.where(hole, np.nan, values)))
+    square = jax.jit(jax.grad(lambda v: jnp.sum(js.Image(v, weights=weights).normalised().values ** 2)))
+    slope = square(jnp.asarray(np.where(hole, np.nan, values)))
     assert np.isfinite(slope).all()
     assert not np.asarray(slope)[hole].any()
     again = images[0].with_values(jnp.asarray(np.where(hole, np.nan, 2 * values)))
@@ -164,12 +164,8 @@ def test_loss_with_weights_and_its_gradient(case, holed):
 def test_error_bars_are_the_diagonal_of_the_inverse(case, rng):
     """Against the dense inverse; and against heights of a thousand disturbed problems, pixels and membrane alike."""
     error, carried, _ = case
-    matrix, b, hats, ratio = dense(error, carried)
-    scene = error.scene
-    triangle = locate(carried.x, carried.y, carried.flip, scene.grid, carried.triangle).triangle
-    moments = Moments.of(scene.image.values.reshape(-1), scene.grid, triangle, carried.x, carried.y, carried.flip)
-    z, variance = exact_height(moments.normal_equations(carried.x, carried.y, carried.flip), error.ratio)
-    np.testing.assert_allclose(np.ravel(z), np.linalg.solve(matrix, b), atol=1e-10)
+    matrix, _, hats, ratio = dense(error, carried)
+    scene, variance = error.scene, _variance(error, carried)
     np.testing.assert_allclose(np.ravel(variance), np.diag(np.linalg.inv(matrix)), rtol=1e-9)
     noise, weights, n = 0.1, np.ravel(scene.image.weights), 4000
     pixels = hats @ (np.sqrt(weights)[:, None] * rng.normal(size=(weights.size, n)))
@@ -180,6 +176,24 @@ def test_error_bars_are_the_diagonal_of_the_inverse(case, rng):
     np.subtract.at(membrane, edges[:, 0], springs)
     drawn = np.linalg.solve(matrix, noise * (pixels + np.sqrt(ratio) * membrane))
     np.testing.assert_allclose(drawn.std(axis=1), noise * np.sqrt(np.ravel(variance)), rtol=0.06)
+
+
+def test_a_fitted_mesh_serves_other_images(case):
+    """Its own image gives its own heights, 5 - 2 times it 5 - 2 times the heights; other pixels are refused. Error bars are in its unit."""
+    error, carried, found = case
+    nothing = dict.fromkeys(("uniform", "law", "law_stiffness", "stiffness", "fit", "status"))
+    fitted = js.reconstruction.Reconstructed(scene=error.scene, fitted=found, carried=carried, error=error, **nothing)
+    low, extent = float(error.scene.low), float(error.scene.extent)
+    own = error.scene.image.with_values(low + extent * error.scene.image.values)
+    np.testing.assert_allclose(fitted.surface_of(own).z_best, found.z_best, atol=1e-10)
+    other = fitted.surface_of(own.with_values(5 - 2 * own.values))
+    np.testing.assert_allclose(other.z_best, 5 - 2 * found.z_best, atol=1e-10)
+    np.testing.assert_allclose(other.rmse, 2 * np.array(found.rmse), rtol=1e-9)
+    np.testing.assert_allclose(np.ravel(fitted.error_bars(0.3)), 0.3 * np.sqrt(np.diag(np.linalg.inv(dense(error, carried)[0]))), rtol=1e-8)
+    with pytest.raises(ValueError, match="was fitted to one of"):
+        fitted.surface_of(js.Image(np.ones((5, 5))))
+    with pytest.raises(ValueError, match="noise = 0"):
+        fitted.error_bars(0.0)
 
 
 @pytest.mark.parametrize(

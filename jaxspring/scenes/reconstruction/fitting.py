@@ -114,8 +114,32 @@ class Reconstructed:
         n_columns = self.fitted.x.shape[1]
         if n_columns > LONGEST_ROW:
             raise ValueError(f"the mesh has rows of {n_columns} nodes; error bars are made for at most {LONGEST_ROW}. Fit fewer columns.")
-        final = eqx.tree_at(lambda c: c.flip, self.carried, jnp.asarray(self.fitted.flip))
-        return noise * np.sqrt(np.asarray(_variance(self.error, final)))
+        return noise * np.sqrt(np.asarray(_variance(self.error, self._final)))
+
+    def surface_of(self, image: Image) -> Surface:
+        """Another image of the same pixels on the fitted mesh: a colour, a band, another time. Only the heights are its own.
+
+        Args:
+            image: of the shape, spacing and origin of the one that the mesh was fitted to, in any unit; weights may differ.
+
+        Returns:
+            The mesh with the heights and errors of that image.
+
+        Raises:
+            ValueError: an image of other pixels.
+        """
+        own, ours = (np.array([*i.shape, *i.spacing, *i.origin]) for i in (image, self.scene.image))
+        if not (own == ours).all():
+            raise ValueError(f"image has (ny, nx), spacing and origin {own}, but the mesh was fitted to one of {ours}. Cut it to the same.")
+        nodes = self.fitted.x.shape[0], self.fitted.x.shape[1]
+        error = SurfaceError(Reconstruction(image, nodes), self.error.weight, self.error.membrane)
+        start = eqx.tree_at(lambda c: c.z, self._final, error.scene.image.sample(self._final.x, self._final.y))
+        return measure(error, start, diagonals=False)
+
+    @property
+    def _final(self) -> Carried:
+        """The fitted mesh, its cells cut as it was measured."""
+        return eqx.tree_at(lambda c: c.flip, self.carried, jnp.asarray(self.fitted.flip))
 
 
 def prepare_springs(image: Image, settings: SpringSettings) -> tuple[SpringLoss, Carried]:

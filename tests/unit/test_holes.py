@@ -143,6 +143,7 @@ def test_uniform_mesh_is_measured_alike(holed):
     assert whole[0] <= whole[1] < 1.001 * whole[0]
 
 
+@pytest.mark.slow
 def test_loss_with_weights_and_its_gradient(case, holed):
     """Weights that are all alike change nothing. With holes the gradient in the nodes is that of differences."""
     values, _ = holed

@@ -102,6 +102,7 @@ def test_hubers_loss_is_minimised_and_bears_outliers(problem):
     np.testing.assert_allclose(found.share, np.minimum(1, delta / np.abs(found.residual)), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_heights_have_the_derivatives_of_the_minimum(problem):
     """By points, weights and nodes, with Huber's loss, against central differences."""
     cloud, flip = problem.cloud, jnp.asarray(problem.flip)

@@ -130,7 +130,12 @@ PUBLIC: dict[str, dict[str, tuple[str, ...]]] = {
             "gradient_magnitude",
             "principal_curvatures",
         ),
-        "images.files": ("Channel", "ImageError", "Luminance", "elevation_model", "image_from_array"),
+        "images.files": ("ImageError", "elevation_model", "image_from_array"),
+        "images.channels": ("Channel", "Luminance", "TerrainRGB", "Terrarium"),
+        "images.holes": ("Holes",),
+        "images.maps": ("Map", "load_map"),
+        "images.points": ("PointCloud",),
+        "images.point_files": ("load_points",),
     },
     "inverse": {
         "inverse.fit": ("History", "Iteration"),
@@ -163,6 +168,8 @@ PUBLIC: dict[str, dict[str, tuple[str, ...]]] = {
         "scenes.reconstruction.pixels": ("PixelSprings",),
         "scenes.reconstruction.fitting": ("Reconstructed", "SpringSettings", "fit_springs"),
         "scenes.reconstruction.constants": ("ConstantsSettings", "fit_constants"),
+        "scenes.reconstruction.points": ("PointSettings", "PointSurface", "fit_points", "point_heights"),
+        "scenes.reconstruction.ground": ("Ground", "GroundSettings", "ground_of_points"),
     },
     "robot": {
         "forces.actuation": ("Actuation",),

@@ -15,5 +15,12 @@ if TYPE_CHECKING:  # written by `python -m tests.face`
     from .scenes.reconstruction.fitting import fit_springs as fit_springs
     from .scenes.reconstruction.constants import ConstantsSettings as ConstantsSettings
     from .scenes.reconstruction.constants import fit_constants as fit_constants
+    from .scenes.reconstruction.points import PointSettings as PointSettings
+    from .scenes.reconstruction.points import PointSurface as PointSurface
+    from .scenes.reconstruction.points import fit_points as fit_points
+    from .scenes.reconstruction.points import point_heights as point_heights
+    from .scenes.reconstruction.ground import Ground as Ground
+    from .scenes.reconstruction.ground import GroundSettings as GroundSettings
+    from .scenes.reconstruction.ground import ground_of_points as ground_of_points
 else:
     __all__, __getattr__, __dir__ = _face(__name__)

@@ -190,7 +190,12 @@ DOORS: dict[str, Door] = {
             "fade": number(0.25),
         },
     ),
-    "Image": Door(js.Image, {"values": PIXELS, "spacing": np.array([1.0, 2.0]), "origin": np.array([0.5, 0.25])}),
+    "Image": Door(js.Image, {"values": PIXELS, "spacing": np.array([1.0, 2.0]), "origin": np.array([0.5, 0.25]), "weights": PIXELS}),
+    "PointCloud": Door(
+        js.images.PointCloud,
+        {"points": np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 2.0], [0.0, 1.0, 3.0]]), "weights": np.array([1.0, 2.0, 3.0])},
+        on_host=("points", "weights"),
+    ),
     "ImageAttraction": Door(lambda strength: js.ImageAttraction(image(), strength), {"strength": number(2.0)}),
     "ImageStiffness": Door(
         lambda **a: js.ImageStiffness(image(), radius=4, **a), {"k_min": number(1.0), "k_max": number(9.0), "sigma": number(1.0)}
@@ -347,7 +352,9 @@ BY_HAND = {
     "check_gradient",
     "frequency_response",
     "from_networkx",
+    "ground_of_points",
     "plot",
+    "point_heights",
     "save_obj",
     "save_ply",
     "save_stl",
@@ -358,8 +365,8 @@ BY_HAND = {
 # What the library makes and hands out; nobody else builds it.
 MADE_INSIDE = """
     Account Blocks Body BoundSystem CellDyads Cloth ClothScene Creased Energy Equilibrium Finding Fit GradientCheck
-    History Impulse Iteration Memory MeshReport Modes Moduli NetBatch NodeDyads OdeInfo OdeResult Onset Overlay
-    Profile Reconstructed Result Resume Scene Selection SkylineFactor SolveInfo Solves SpringBlocks SpringMatrix
+    Ground History Impulse Iteration Map Memory MeshReport Modes Moduli NetBatch NodeDyads OdeInfo OdeResult Onset Overlay
+    PointSurface Profile Reconstructed Result Resume Scene Selection SkylineFactor SolveInfo Solves SpringBlocks SpringMatrix
     Status Step Surface Torn Undetermined Yielded
 """
 
@@ -368,16 +375,16 @@ NO_ARRAYS = """
     Adam AllPairs BDF2 BackwardEuler BackwardEulerHeat Bilinear BlockJacobi Bounded CG Cells Channel Checkpoint
     CheckpointError Checkpointed ClothSettings ConstantsSettings CrankNicolsonHeat CubicSpline Curvature Cutoff
     EnergyLaw EqualCells ExactSolver ExactTangent ExpansionRule ExplicitHeat Flag Force ForwardEuler
-    GradientMagnitude GradientWarning HalfCells HeatIteration HeatScheme HeightField Hooke Identity ImageError
+    GradientMagnitude GradientWarning GroundSettings HalfCells HeatIteration HeatScheme HeightField Holes Hooke Identity ImageError
     ImplicitMidpoint Impulses Intensity Jacobi JaxCG LBFGS Lattice Law LeastSquares Ledger LinearSolver
     Linearisation Lineax Luminance Molten Moving Multigrid Natural NeuralController Newton NoCutoff Observation
-    Obstacle Optax Optimiser Ordering PairLaw Pairs Positive PowerLaw Preconditioner Progress Published PullLaw
+    Obstacle Optax Optimiser Ordering PairLaw Pairs PointSettings Positive PowerLaw Preconditioner Progress Published PullLaw
     Reconstruction Relaxation ReverseCuthillMcKee Robot RobotSettings Rule RungeKutta4 Sampling Secant SemiImplicit
     SignedDistance SimulationError Skyline SoftPositive SplitHeat SpringSettings StabilityWarning Stepper
     StiffnessRule Still Stop StopReason StoreAll StoreStates SymmetricSplitHeat SymplecticEuler Tangent TensionOnly
-    ThermalBoundary Topology Transform Unpreconditioned VelocityVerlet animate batch body_of_cells cantilever cusick
-    disc distance domain drape_coefficient elevation_model energy_ledger equilibrium fit_constants fit_springs flag
-    from_mesh gradient_magnitude hanging impulses load load_image melted_fraction normal_modes on_ball on_table
+    TerrainRGB Terrarium ThermalBoundary Topology Transform Unpreconditioned VelocityVerlet animate batch body_of_cells cantilever cusick
+    disc distance domain drape_coefficient elevation_model energy_ledger equilibrium fit_constants fit_points fit_springs flag
+    from_mesh gradient_magnitude hanging impulses load load_image load_map load_points melted_fraction normal_modes on_ball on_table
     pad_nets principal_curvatures push_out raise_for_status rectangle save save_trajectory select smoothing_radius
     stable_dt total_heat train walk
 """

@@ -20,7 +20,7 @@ from jaxtyping import Array
 
 from .._checks import finite, kind
 from ..forces.base import any_not_positive
-from ..images.image import Image
+from ..images.image import Image, without_holes
 from ..images.sampling import CubicSpline, Sampling
 from ..images.surface import Surface
 from ..numerics import cast_inexact
@@ -38,7 +38,7 @@ class HeightField(Obstacle):
 
     Raises:
         TypeError: what is no image, or no sampling.
-        ValueError: a height that is not finite.
+        ValueError: a height that is not finite; an image with weights.
 
     >>> ramp = HeightField(js.Image(np.array([[0.0, 1.0, 2.0]])), js.images.Bilinear())
     >>> print(ramp.distance(js.Vector((np.array([0.5]), np.array([1.5]))), jnp.array(0.0)).round(4))
@@ -49,8 +49,9 @@ class HeightField(Obstacle):
     sampling: Sampling
 
     def __init__(self, image: Image, sampling: Sampling | None = None):
-        self.image = kind("image", image, Image, "Image(heights, spacing=0.1)")
-        finite("image.values", image.values)
+        image = kind("image", image, Image, "Image(heights, spacing=0.1)")
+        self.image = without_holes("image", image, "a ground must be somewhere at every place.")
+        finite("image.values", self.image.values)
         self.sampling = CubicSpline() if sampling is None else kind("sampling", sampling, Sampling, "CubicSpline()")
 
     def distance(self, position: Vector, time: Array) -> Array:

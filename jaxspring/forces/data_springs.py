@@ -6,6 +6,8 @@
 The slide prints the first as a norm; its code (`force.z += IMAGE_CONST * (val - p.z)`) is what is meant. That law pulls z alone, so its
 Jacobian is not symmetric where the image has a slope, and it has no potential. `conservative=True` adds the missing in-plane part,
 -k e grad d with e = d - z, which makes it the gradient of k/2 e^2.
+
+Where the image has weights w, read between its pixels as the image is, the stiffness is k_data w(x_i, y_i): over a hole nothing pulls.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ from jaxtyping import Array
 
 from .._arrays import Numbers
 from .._checks import as_inexact, finite, has_shape, node_values, nonnegative
-from ..images.image import Image
+from ..images.image import Image, without_holes
 from ..images.sampling import Bilinear, Sampling
 from ..images.surface import Surface
 from ..linalg.operators import Blocks, NodeDyads
@@ -34,10 +36,13 @@ class DataSprings(Force):
     """A spring from every node to the image surface above or below it, along z.
 
     Attributes:
-        image: the data d(x, y); its values have the unit of z [m].
+        image: the data d(x, y); its values have the unit of z [m]. Its weights multiply the stiffness.
         stiffness: k_data [N/m], one number, or (N,) in the user's order; on a lattice also its shape.
         sampling: how the image is read between pixels.
         conservative: add the in-plane part that makes the force the gradient of an energy.
+
+    Raises:
+        ValueError: a negative stiffness; conservative, with an image that has weights.
     """
 
     image: Image | Surface
@@ -46,7 +51,8 @@ class DataSprings(Force):
     conservative: bool = eqx.field(static=True)
 
     def __init__(self, image: Image, stiffness: Numbers, sampling: Sampling | None = None, conservative: bool = False):
-        self.image = image
+        why = "the energy of a conservative spring would fall over a hole, whatever the heights, and push nodes there."
+        self.image = without_holes("image", image, why) if conservative and isinstance(image, Image) else image
         self.stiffness = node_values("stiffness", stiffness)
         self.sampling = Bilinear() if sampling is None else sampling
         self.conservative = conservative
@@ -107,11 +113,14 @@ class DataSprings(Force):
         return _rounding(_surface(self), state)
 
     def invalid(self) -> Array:
-        """Whether the stiffness is negative or not finite, or the image's spacing not positive."""
-        return any_refused(self.stiffness) | any_not_positive(self.image.spacing)
+        """Whether the stiffness or a weight is negative or not finite, or the image's spacing not positive."""
+        cover = _surface(self).cover
+        refused = any_refused(self.stiffness) if cover is None else any_refused(self.stiffness, cover.coefficients)
+        return refused | any_not_positive(self.image.spacing)
 
     def _stiffness(self, state: State) -> Array:
-        return state.layout.constant("stiffness", self.stiffness)
+        stiffness, cover = state.layout.constant("stiffness", self.stiffness), _surface(self).cover
+        return stiffness if cover is None else stiffness * cover.value(state.position[0], state.position[1])
 
 
 class ImageAttraction(Force):
@@ -121,6 +130,9 @@ class ImageAttraction(Force):
         image: d(x, y).
         strength: [J per unit of the image]; negative draws to the dark.
         sampling: how the image is read between pixels; the cubic spline has a continuous force.
+
+    Raises:
+        ValueError: a strength that is not finite; an image with weights.
     """
 
     image: Image | Surface
@@ -128,7 +140,7 @@ class ImageAttraction(Force):
     sampling: Any
 
     def __init__(self, image: Image, strength: Numbers, sampling: Sampling | None = None):
-        self.image = image
+        self.image = without_holes("image", image, "a potential must be known everywhere.") if isinstance(image, Image) else image
         self.strength = as_inexact("strength", strength)
         has_shape("strength", self.strength, {"one number": ()})
         finite("strength", self.strength)

@@ -21,11 +21,18 @@ if TYPE_CHECKING:  # written by `python -m tests.face`
     from .observation import adaptation as adaptation
     from .observation import gradient_magnitude as gradient_magnitude
     from .observation import principal_curvatures as principal_curvatures
-    from .files import Channel as Channel
     from .files import ImageError as ImageError
-    from .files import Luminance as Luminance
     from .files import elevation_model as elevation_model
     from .files import image_from_array as image_from_array
+    from .channels import Channel as Channel
+    from .channels import Luminance as Luminance
+    from .channels import TerrainRGB as TerrainRGB
+    from .channels import Terrarium as Terrarium
+    from .holes import Holes as Holes
+    from .maps import Map as Map
+    from .maps import load_map as load_map
+    from .points import PointCloud as PointCloud
+    from .point_files import load_points as load_points
     from .image import Image as Image
     from .files import load_image as load_image
 else:

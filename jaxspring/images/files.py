@@ -9,13 +9,15 @@ from __future__ import annotations
 import os
 import stat
 import warnings
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import numpy as np
 from jax.core import Tracer
 from numpy.typing import ArrayLike
 
-from .channels import Channel, Luminance, Pixels
+from .channels import OneChannel, Pixels
+from .holes import Holes
 from .image import Image, PerAxis
 from .numpy_files import read_npy, read_npz
 from .tiff_files import MAGIC, read_tiff
@@ -23,6 +25,7 @@ from .tiff_files import MAGIC, read_tiff
 MAX_PIXELS = 64_000_000
 """Largest image that is loaded unless told otherwise: 64 million pixels are 0.5 GB in float64."""
 
+T = TypeVar("T")
 _PNG_HEAD = 26  # bytes up to the bits per channel and the kind of colour
 
 
@@ -35,47 +38,63 @@ class ImageError(ValueError):
 
 def image_from_array(
     pixels: ArrayLike,
-    channel: Channel | Luminance | None = None,
+    channel: OneChannel | None = None,
     *,
     spacing: PerAxis = 1.0,
     origin: PerAxis = 0.0,
     fill: float | None = None,
+    holes: Holes | None = None,
 ) -> Image:
     """An `Image` from a NumPy array `(ny, nx)`, or `(ny, nx, n_channels)` with a `channel` that says which grey to take.
 
     Args:
         pixels: the array, of any real type.
-        channel: `Luminance()`, `Channel(index)`, or None for an array of one channel.
+        channel: `Luminance()`, `Channel(index)`, `TerrainRGB()`, `Terrarium()`, or None for an array of one channel.
         spacing: distance between pixels [m], as in `Image`.
         origin: position of the first pixel [m], as in `Image`.
-        fill: number to put where a pixel is masked (in a masked array), NaN or infinite; without it such an array is refused.
+        fill: number to put where a pixel is masked (in a masked array), NaN or infinite; without it such an array is refused, unless
+        holes: says that pixels without a value are holes, and which further ones have none; see `Holes`.
 
     Returns:
         The image, its pixels in the unit of the array.
 
     Raises:
-        ValueError: a shape without a channel that fits, pixels without a value and no `fill`; else as `Image`.
+        ValueError: a shape without a channel that fits, pixels without a value and neither `fill` nor `holes`, or both; else as `Image`.
         TypeError: traced pixels, or pixels of a type that `Image` refuses.
 
     >>> import numpy as np
-    >>> print(image_from_array(np.ones((2, 2, 3)), Luminance()).values[0])
+    >>> print(image_from_array(np.ones((2, 2, 3)), js.images.Luminance()).values[0])
     [1. 1.]
     """
     if isinstance(pixels, Tracer):
         raise TypeError("pixels are traced, so that they cannot be looked at: build Image(values) inside jit and grad.")
     mask = np.ma.getmaskarray(pixels) if isinstance(pixels, np.ma.MaskedArray) else None
-    return Image(Pixels(np.asarray(pixels), mask=mask).one_channel(channel, fill), spacing, origin)
+    return image_of(Pixels(np.asarray(pixels), mask=mask), channel, spacing, origin, fill, holes)
+
+
+def image_of(
+    pixels: Pixels, channel: OneChannel | None, spacing: PerAxis, origin: PerAxis, fill: float | None, holes: Holes | None
+) -> Image:
+    """The image of what a file holds, its pixels without a value filled, made holes, or refused."""
+    if holes is None:
+        return Image(pixels.one_channel(channel, fill), spacing, origin)
+    if fill is not None:
+        raise ValueError(f"fill = {fill} and holes are both given, but a hole is not filled: pass one of them.")
+    values, weights = pixels.weighted(channel, holes)
+    # Where there is no hole there are no weights: nothing is carried along for them.
+    return Image(values, spacing, origin, None if weights is None or (weights == 1).all() else weights)
 
 
 def load_image(
     path: str | os.PathLike[str],
-    channel: Channel | Luminance | None = None,
+    channel: OneChannel | None = None,
     *,
     array: str | None = None,
     page: int | None = None,
     spacing: PerAxis = 1.0,
     origin: PerAxis = 0.0,
     fill: float | None = None,
+    holes: Holes | None = None,
     max_pixels: int = MAX_PIXELS,
 ) -> Image:
     """An `Image` from a PNG, JPEG or TIFF file (needs the extra `viz`) or from a NumPy `.npy` or `.npz` file.
@@ -85,16 +104,18 @@ def load_image(
     grey; no colour profile and no gamma is applied, and inks (CMYK) become RGB without a profile.
 
     A pixel has no value where the file declares it as no-data (GDAL's tag), masks it, or makes it transparent: that is an error, or `fill`
-    stands there. A half transparent pixel is mixed with `fill` as with a background.
+    stands there, or with `holes` it is a hole. A half transparent pixel is mixed with `fill` as with a background; with `holes` it weighs
+    half.
 
     Args:
         path: the file.
-        channel: `Luminance()`, `Channel(index)`, or None for files of one channel.
+        channel: `Luminance()`, `Channel(index)`, `TerrainRGB()` and `Terrarium()` for tiles, or None for files of one channel.
         array: which array of an `.npz` file; may be left out where there is only one.
         page: which page of a TIFF, or frame of an animated PNG, from 0; may be left out where there is only one.
         spacing: distance between pixels [m], as in `Image`.
         origin: position of the first pixel [m], as in `Image`.
-        fill: number to put where a pixel has no value, is NaN or infinite; without it such a file is refused.
+        fill: number to put where a pixel has no value, is NaN or infinite; without it such a file is refused, unless
+        holes: says that pixels without a value are holes, and which further ones have none; see `Holes`.
         max_pixels: larger images are refused before they are decoded.
 
     Returns:
@@ -104,9 +125,13 @@ def load_image(
         ImageError: the file cannot be used; one line says why.
         ImportError: it is not a NumPy file, and Pillow (or tifffile, for TIFF) is not installed.
     """
+    return usable(path, lambda: image_of(_read_pixels(os.fspath(path), array, page, max_pixels), channel, spacing, origin, fill, holes))
+
+
+def usable(path: str | os.PathLike[str], read: Callable[[], T]) -> T:
+    """What `read` makes of a file; whatever goes wrong becomes one `ImageError` of one line that names the file."""
     try:
-        pixels = _read_pixels(os.fspath(path), array, page, max_pixels)
-        return Image(pixels.one_channel(channel, fill), spacing, origin)
+        return read()
     except ImportError:
         raise
     except OSError as error:

@@ -6,6 +6,8 @@ Position component 0 is x, along the columns; component 1 is y, along the rows. 
 
 so with spacing 1 and origin 0, `values[y, x]` sits at `(x, y)`. Outside the outermost pixels the coordinate is clamped: the value is
 that of the nearest border point and the slope across the border is exactly zero.
+
+A pixel may have a weight: how much its value counts in data springs and errors. One of weight zero is a hole; see `holes.py`.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ from jaxtyping import Array
 from .._arrays import given, own
 from .._checks import as_inexact, shape_of
 from ..numerics import power_of_two
+from .holes import checked_weights, continued
 from .sampling import Bilinear, Sampling
 from .surface import Surface
 
@@ -36,9 +39,13 @@ class Image(eqx.Module):
         values: pixels `(ny, nx)`, row by row, in the image's own unit. Whole numbers and booleans become the default float type.
         spacing: distance between neighbouring pixels `(along x, along y)` [m, or whatever length the node positions are in].
         origin: position `(x, y)` of pixel `values[0, 0]`, in the same unit.
+        weights: how much each pixel counts, `(ny, nx)`, zero or more, for instance one over the variance of its noise; None where all count
+            alike. Zero is a hole: what `values` holds there, NaN too, is not read, and the continuation of the data around it takes its
+            place.
 
     Raises:
-        ValueError: no pixels, not two axes, a pixel that is NaN or infinite, a spacing that is not positive, an origin that the pixels'
+        ValueError: no pixels, not two axes, a pixel of weight above zero that is NaN or infinite, weights that are negative, not finite or
+            all zero, a spacing that is not positive, an origin that the pixels'
             type cannot hold to a thousandth of the spacing.
             Of traced values only shape and type are looked at.
         TypeError: complex, text or half-precision pixels.
@@ -47,14 +54,18 @@ class Image(eqx.Module):
     >>> image = Image(np.array([[0.0, 1.0], [10.0, 11.0]]))
     >>> print(image.sample(1.0, 0.5))
     6.0
+    >>> holed = Image(np.array([[0.0, 1.0], [np.nan, 1.0]]), weights=np.array([[1.0, 1.0], [0.0, 1.0]]))
+    >>> print(holed.n_holes, holed.sample(0.0, 0.0))
+    1 0.0
     """
 
     values: Array
     spacing: tuple[Array, Array]
     origin: tuple[Array, Array]
+    weights: Array | None
 
-    def __init__(self, values: ArrayLike, spacing: PerAxis = 1.0, origin: PerAxis = 0.0):
-        self.values = _as_pixels(values)
+    def __init__(self, values: ArrayLike, spacing: PerAxis = 1.0, origin: PerAxis = 0.0, weights: ArrayLike | None = None):
+        self.values, self.weights = _as_pixels(values, weights)
         self.spacing = _per_axis("spacing", spacing, self.values.dtype, must_be_positive=True)
         # A generator gives its numbers once, and they are looked at twice.
         place: Any = origin if isinstance(origin, tuple | list) else given("origin", origin)
@@ -72,22 +83,39 @@ class Image(eqx.Module):
         """Floating type of the pixels."""
         return jnp.result_type(self.values)
 
+    @property
+    def n_holes(self) -> Array | int:
+        """Number of pixels of weight zero."""
+        return 0 if self.weights is None else jnp.sum(self.weights == 0)
+
     def with_values(self, values: Array) -> Image:
-        """The same geometry and floating type with other pixels `(ny, nx)`; their values are not checked."""
+        """The same geometry, floating type and weights with other pixels `(ny, nx)`, not checked; holes get their continuation."""
         if jnp.shape(values) != jnp.shape(self.values):
             raise ValueError(f"values has shape {jnp.shape(values)}, but the image has {jnp.shape(self.values)}: pass one value per pixel.")
-        return eqx.tree_at(lambda image: image.values, self, own("values", values, self.dtype))
+        values = own("values", values, self.dtype)
+        return self.filtered(values if self.weights is None else continued(values, self.weights))
+
+    def filtered(self, values: Array) -> Image:
+        """The same with what a filter made of the pixels, holes included: nothing is continued anew."""
+        return eqx.tree_at(lambda image: image.values, self, values)
+
+    def filled(self) -> Image:
+        """The same without weights: the continuation under the holes counts as data from here on."""
+        return eqx.tree_at(lambda image: image.weights, self, None, is_leaf=lambda leaf: leaf is None)
 
     def normalised(self) -> Image:
         """Pixels scaled to [0, 1] by their whole range; a constant image becomes 0."""
         values = of_order_one(self.values)
         low, high = jnp.min(values), jnp.max(values)
         extent = jnp.where(high > low, high - low, 1)
-        return self.with_values((values - low) / extent)
+        return self.filtered((values - low) / extent)
 
     def surface(self, method: Sampling = Bilinear()) -> Surface:  # noqa: B008 (frozen, holds no array)
         """The image made ready to be read between its pixels. Make it once, outside a loop: `CubicSpline` filters the pixels here."""
-        return Surface(method.coefficients(self.values), self.spacing, self.origin, self.shape, method)
+        cover = None
+        if self.weights is not None:
+            cover = Surface(self.weights, self.spacing, self.origin, self.shape, Bilinear())
+        return Surface(method.coefficients(self.values), self.spacing, self.origin, self.shape, method, cover)
 
     def sample(self, x: ArrayLike, y: ArrayLike, method: Sampling = Bilinear()) -> Array:  # noqa: B008
         """Values at the points `(x, y)`; see `Surface.value`."""
@@ -140,11 +168,23 @@ def _check_place(given: Any, origin: tuple[Array, Array], spacing: tuple[Array, 
             )
 
 
-def _as_pixels(values: ArrayLike) -> Array:
-    """Pixels as a floating array; refuse what is not one channel of finite real numbers, naming what came and what to do."""
+def without_holes(name: str, image: Image, why: str) -> Image:
+    """The image, which has no weights; else ValueError."""
+    if image.weights is not None:
+        raise ValueError(
+            f"{name} has weights or holes, but {why} Pass {name}.filled(), in which holes are continued from their neighbours."
+        )
+    return image
+
+
+def _as_pixels(values: ArrayLike, weights: ArrayLike | None) -> tuple[Array, Array | None]:
+    """Pixels and weights as floating arrays; refuse what is not one channel of finite real numbers, naming what came and what to do."""
     if isinstance(values, np.ma.MaskedArray) and np.ma.getmaskarray(values).any():
         row = tuple(int(i) for i in np.argwhere(np.ma.getmaskarray(values))[0])
-        raise ValueError(f"values{list(row)} is masked: what lies under a mask is no pixel. Use image_from_array(values, fill=<number>).")
+        raise ValueError(
+            f"values{list(row)} is masked: what lies under a mask is no pixel. "
+            "Use image_from_array(values, fill=<number>), or holes=Holes()."
+        )
     array: Any = given("values", values)
     if not isinstance(array, Tracer):
         array = np.asarray(array)
@@ -156,19 +196,24 @@ def _as_pixels(values: ArrayLike) -> Array:
         raise ValueError(f"values has shape {shape}, but an image has one channel, (ny, nx): {cure}.")
     if 0 in shape:
         raise ValueError(f"values has shape {shape}: there is no pixel to sample. Pass at least one row and one column.")
+    weight = None if weights is None else checked_weights(weights, shape, dtype)
     if isinstance(array, np.ndarray):
         # Converted here and not by JAX, which knows neither foreign byte orders nor long doubles; what overflows is found below.
         with np.errstate(over="ignore"):
             array = array.astype(dtype)
-        bad = np.argwhere(~np.isfinite(array))
+        counts = True if weight is None or isinstance(weight, Tracer) else np.asarray(weight > 0)
+        bad = np.argwhere(~np.isfinite(array) & counts)
         if len(bad):
             row, column = (int(i) for i in bad[0])
             raise ValueError(
                 f"values[{row}, {column}] is {array[row, column]} in {dtype} ({len(bad)} of {array.size} pixels are not finite).\n"
                 "Unchecked, it would spoil every sample in the four cells around it, even exactly on a good neighbour (0 * NaN is NaN).\n"
-                "Repair the pixels, or load them with fill=<number> to replace each one that is not finite."
+                "Repair the pixels, load them with fill=<number> to replace each one that is not finite, or give them the weight 0."
             )
-    return own("values", array, dtype)
+    if weight is None:
+        return own("values", array, dtype), None
+    filled = continued(array if isinstance(array, np.ndarray) else array.astype(dtype), weight)
+    return own("values", filled, dtype), own("weights", weight, dtype)
 
 
 def _floating(dtype: np.dtype[Any]) -> np.dtype[Any]:

@@ -184,14 +184,19 @@ def adaptation(
     >>> print(adaptation(step, 0.0).values[0])
     [0. 0. 1. 1. 0. 0.]
     """
-    observed = smooth(image.with_values(observation(image)), sigma, radius)
+    observed = smooth(image.filtered(_observed(image, observation)), sigma, radius)
     values = of_order_one(observed.values)
     low = jnp.minimum(jnp.min(values), 0)
     extent = jnp.max(values) - low
     # NaN is not "nothing to see": compare so that it passes through.
     is_empty = extent <= 0
     scaled = (values - low) / jnp.where(is_empty, 1, extent)
-    return observed.with_values(jnp.where(is_empty, 0, scaled))
+    return observed.filtered(jnp.where(is_empty, 0, scaled))
+
+
+def _observed(image: Image, observation: Callable[[Image], Array]) -> Array:
+    """What a function of the image gives, one number per pixel."""
+    return image.filled().with_values(observation(image)).values
 
 
 def _slope(values: Array, axis: int) -> Array:

@@ -72,7 +72,7 @@ def smooth(image: Image, sigma: Length, radius: int | None = None) -> Image:
     for axis, spacing in ((1, image.spacing[0]), (0, image.spacing[1])):
         if values.shape[axis] > 1:
             values = filter_axis(values, _gaussian_band(width / spacing, radius), radius, axis, mode="symmetric")
-    return image.with_values(values)
+    return image.filtered(values)
 
 
 def smoothing_radius(sigma: Length, spacing: Length | tuple[Length, Length] = 1.0, deviations: float = 4.0) -> int:

@@ -36,6 +36,7 @@ class Surface(eqx.Module):
         origin: position (x, y) of the first pixel [m], two 0-d arrays.
         shape: `(ny, nx)` (static).
         method: how to read between pixels.
+        cover: the weights of the pixels, to be read bilinearly; None where all count alike.
     """
 
     coefficients: Array
@@ -43,6 +44,7 @@ class Surface(eqx.Module):
     origin: tuple[Array, Array]
     shape: tuple[int, int] = eqx.field(static=True)
     method: Sampling
+    cover: Surface | None = None
 
     @_one_program
     def value(self, x: ArrayLike, y: ArrayLike) -> Array:

@@ -48,6 +48,19 @@ def read_tiff(stream: IO[bytes], page: int | None, max_pixels: int) -> Pixels:
     return Pixels(values, nodata, hidden, values.shape[-1] - len(extra) + alpha, extra[alpha] == _PREMULTIPLIED)
 
 
+def read_place(stream: IO[bytes], page: int | None) -> dict[str, Any] | None:
+    """The GeoTIFF tags of a page, by their names; None where it has none."""
+    import tifffile
+
+    with _quiet(), tifffile.TiffFile(stream) as file:
+        chosen, _ = _pages(file, page)
+        tags = chosen.geotiff_tags
+        turned = chosen.tags.get("Orientation")
+        if tags is not None and turned is not None and int(turned.value) != 1:
+            raise ValueError("it has a place on a map and is turned by its orientation tag as well; save it upright.")
+        return tags
+
+
 def _pages(file: Any, page: int | None) -> tuple[Any, Any]:
     """The page to be read and its mask page, if it has one. Smaller copies of a page are no pages of their own."""
     kept = [p for p in file.pages if not p.subfiletype & 5]

@@ -142,8 +142,8 @@ def read_off(path: pathlib.Path) -> RawMesh:
     return raw_mesh(path, points, faces, (), places)
 
 
-def read_ply(path: pathlib.Path) -> RawMesh:
-    """Vertices, faces and edges of a Stanford PLY, text or binary; all else is passed over."""
+def ply_elements(path: pathlib.Path) -> dict[str, dict[str, Any]]:
+    """The properties of every element of a Stanford PLY, text or binary."""
     data = path.read_bytes()
     order, elements, at = _ply_header(path, data)
     words = data[at:].split() if not order else []
@@ -156,6 +156,12 @@ def read_ply(path: pathlib.Path) -> RawMesh:
                 found[name], words = _text_rows(words, count, properties)
     except (ValueError, IndexError) as error:
         raise ValueError(f"{path} cannot be read, or ends before all that its header promises: {error}.") from error
+    return found
+
+
+def read_ply(path: pathlib.Path) -> RawMesh:
+    """Vertices, faces and edges of a Stanford PLY, text or binary; all else is passed over."""
+    found = ply_elements(path)
     vertex, face, edge = (found.get(name, {}) for name in ("vertex", "face", "edge"))
     if not {"x", "y", "z"} <= set(vertex):
         raise ValueError(f"{path} has no x, y and z of vertices.")

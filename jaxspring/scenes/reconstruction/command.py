@@ -39,6 +39,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--out", metavar="DIR", help="folder for the results (jaxspring-<image>); an older result there is replaced")
     parser.add_argument("--fill", type=number, metavar="VALUE", help="what stands where a pixel is no-data, masked, NaN or transparent")
+    parser.add_argument(
+        "--holes", action="store_true", help="pixels that are no-data, masked, NaN or transparent are holes, which nothing is fitted to"
+    )
+    parser.add_argument(
+        "--nodata", type=number, action="append", metavar="VALUE", help="pixels of this value are holes as well (repeatable)"
+    )
     parser.add_argument("--page", type=whole_number, metavar="N", help="page of a TIFF, or frame of an animated PNG, from 0")
     parser.add_argument(
         "--resume", action="store_true", help="go on from the checkpoint of an interrupted or finished run with the same DIR"
@@ -71,11 +77,17 @@ def run(given: argparse.Namespace, out: pathlib.Path) -> Written:
 
 def load(given: argparse.Namespace) -> Image:
     """The image that the arguments name, or the built-in one."""
-    from ...images.files import Luminance, elevation_model, load_image
+    import numpy as np
 
+    from ...images.channels import Luminance
+    from ...images.files import elevation_model, image_from_array, load_image
+    from ...images.holes import Holes
+
+    holes = Holes(tuple(given.nodata or ()), nan=True) if given.holes or given.nodata else None
     if given.image is None:
-        return elevation_model()
-    return load_image(pathlib.Path(given.image), channel=Luminance(), fill=given.fill, page=given.page)
+        image = elevation_model()
+        return image if holes is None else image_from_array(np.asarray(image.values), holes=holes)
+    return load_image(pathlib.Path(given.image), channel=Luminance(), fill=given.fill, page=given.page, holes=holes)
 
 
 def nodes(text: str) -> tuple[int, int]:

@@ -70,7 +70,7 @@ class Constants(eqx.Module):
     def usual(scene: Reconstruction) -> Constants:
         """A start that serves every image: the law's of the fit of every spring, and data springs that outweigh the mesh's."""
         dtype = scene.image.dtype
-        per_node = scene.grid.n_pixels / scene.net.n_nodes
+        per_node = scene.grid.total / scene.net.n_nodes
         numbers = (1.0, 30.0, 0.25 * scene.spacing, 1.0, 0.15, 1 / per_node)
         return Constants(*(jnp.asarray(number, dtype) for number in numbers))
 

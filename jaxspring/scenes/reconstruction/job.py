@@ -100,7 +100,10 @@ class Job:
     def _checkpoint(self, path: pathlib.Path) -> Checkpoint:
         """Where the fit is saved, and of which problem it is."""
         pixels = np.ascontiguousarray(self.image.values)
-        digest = hashlib.sha256(pixels.data).hexdigest()[:16]
+        digest = hashlib.sha256(pixels.data)
+        if self.image.weights is not None:
+            digest.update(np.ascontiguousarray(self.image.weights).data)
+        digest = digest.hexdigest()[:16]
         size, nodes = ("{}x{}".format(*pair) for pair in (self.image.shape, self.nodes))
         note = f"image {size} {digest}, nodes {nodes}, {','.join(self.parameters)}"
         return Checkpoint(str(path), every=25, note=note)
@@ -111,7 +114,7 @@ class Job:
         run = float(np.sum(of_call[1:]))
         compile_ = max(float(of_call[0]) - (run / max(len(of_call) - 1, 1)), 0.0)
         return {
-            "image": {"name": self.name, "pixels": list(self.image.shape)},
+            "image": {"name": self.name, "pixels": list(self.image.shape), "holes": int(self.image.n_holes)},
             "settings": {"nodes": list(self.nodes), "parameters": list(self.parameters), "iterations": self.n_iterations},
             "versions": versions(),
             "rmse": {
@@ -121,6 +124,7 @@ class Job:
             "folds": found.fitted.folds,
             "folds_at_worst": max(bar.folds, found.fitted.folds),
             "outside": found.fitted.outside,
+            "unreached": 0 if found.fitted.unreached is None else int(found.fitted.unreached.sum()),
             "range": [float(values.min()), float(values.max())],
             "seconds": {"compile": compile_, "run": run, "other": max(seconds - run - compile_, 0.0), "total": seconds},
             "iterations": {"done": len(history.loss) - 1, "best": found.fit.iteration, "ended": found.fit.reason.value},
@@ -149,16 +153,20 @@ class _Bar:
 def mesh_arrays(found: Reconstructed) -> dict[str, np.ndarray]:
     """The fitted mesh: `points` (N, 3) with the best heights, `z_sampled` (N,), `triangles` (T, 3), `edges` (E, 2), `stiffness` (E,) [N/m].
 
+    Of an image with weights also `unreached` (N,): nodes whose heights come from their neighbours.
+
     x and y are in the unit of the image's spacing (pixels for the command), z in that of its values.
     """
     mesh, net = found.fitted, found.scene.net
     points = np.stack([np.ravel(a) for a in (mesh.x, mesh.y, mesh.z_best)], axis=-1).astype(np.float64)
+    unreached = {} if mesh.unreached is None else {"unreached": np.ravel(mesh.unreached)}
     return {
         "points": points,
         "z_sampled": np.ravel(mesh.z_sampled),
         "triangles": triangle_corners(mesh.flip),
         "edges": np.asarray(net.edges),
         "stiffness": np.asarray(found.stiffness),
+        **unreached,
     }
 
 
@@ -180,4 +188,10 @@ def table(report: dict[str, Any]) -> str:
         f"{report['iterations']['done']} iterations in {seconds['run']:.1f} s, after {seconds['compile']:.1f} s of compiling; "
         f"{report['folds']} folded triangles, {report['outside']} pixels outside the mesh"
     )
+    if report["image"]["holes"]:
+        total = math.prod(report["image"]["pixels"])
+        lines.append(
+            f"{report['image']['holes']} of {total} pixels are holes; {report['unreached']} nodes are reached by no datum and take their "
+            "heights from their neighbours"
+        )
     return "\n".join(lines)

@@ -37,6 +37,9 @@ from .triangles import Flip, Node, count_folds
 # A fit cannot be better than this mean square error, in units of the image's range: a constant image has a finite loss and gradient zero.
 _SMALLEST_ERROR = 1e-14
 
+# Springs along z, over all the pixels' springs that a node has on average: some triangles hold no pixel.
+MEMBRANE = 1e-4
+
 
 class Carried(eqx.Module):
     """What one evaluation of the loss leaves for the next.
@@ -63,7 +66,7 @@ class Facts(eqx.Module):
     """What is known about a mesh.
 
     Attributes:
-        rms_best, rms_sampled: errors over all pixels under either rule [image range].
+        rms_best, rms_sampled: errors over the pixels, by their weights, under either rule [image range].
         n_folds: triangles folded over.
         n_lost: pixels in no triangle.
         n_walk: steps of the pixels' walk.
@@ -93,7 +96,7 @@ class SurfaceError(eqx.Module):
 
     scene: Reconstruction
     weight: float = eqx.field(static=True, default=0.9)
-    membrane: float = eqx.field(static=True, default=1e-4)
+    membrane: float = eqx.field(static=True, default=MEMBRANE)
     solver: JaxCG = JaxCG(tolerance=1e-4)
     implicit_height: bool = eqx.field(static=True, default=False)
 
@@ -102,11 +105,11 @@ class SurfaceError(eqx.Module):
         scene, flip = self.scene, carried.flip
         location = locate(x, y, flip, scene.grid, carried.triangle)
         moments = Moments.of(scene.image.values.reshape(-1), scene.grid, location.triangle, x, y, flip)
-        ratio = self.membrane * scene.grid.n_pixels / scene.net.n_nodes
+        ratio = jnp.asarray(self.ratio, x.dtype)
         at = (x, y) if self.implicit_height else lax.stop_gradient((x, y))
-        z, info = best_height(moments.normal_equations(*at, flip), scene.net, jnp.asarray(ratio, x.dtype), carried.z, self.solver)
+        z, info = best_height(moments.normal_equations(*at, flip), scene.net, ratio, carried.z, self.solver)
         best = mean_error(scene, moments.squared_error(x, y, z, flip))
-        tension = ratio * membrane_energy(scene.net, z) / scene.grid.n_pixels
+        tension = ratio * membrane_energy(scene.net, z) / scene.grid.total
         sampled = mean_error(scene, moments.squared_error(x, y, scene.image.surface(Bilinear()).value(x, y), flip))
         value = 0.5 * (self.weight * jnp.log(best + tension) + (1 - self.weight) * jnp.log(sampled))
         left = stopped(Carried(x, y, z, location.triangle, flip, carried.mass_of, carried.age + 1))
@@ -114,6 +117,11 @@ class SurfaceError(eqx.Module):
             jnp.sqrt(best), jnp.sqrt(sampled), count_folds(x, y, flip), location.n_lost, location.n_steps, info.residual, info.status
         )
         return value, (left, stopped(facts))
+
+    @property
+    def ratio(self) -> Array | float:
+        """Stiffness of the springs along z over that of a pixel's spring of weight one [pixels]."""
+        return self.membrane * self.scene.grid.total / self.scene.net.n_nodes
 
     def per_cell(self, x: Node, y: Node, z: Node, carried: Carried, flip: Flip) -> tuple[Float[Array, "my mx"], Float[Array, "my mx"]]:
         """Squared error of each cell cut along `flip`, with heights `z` and with sampled heights [image range^2]."""
@@ -124,8 +132,8 @@ class SurfaceError(eqx.Module):
 
 
 def mean_error(scene: Reconstruction, error: Array) -> Array:
-    """Mean over all pixels of squared errors summed per triangle, floored so that its logarithm is finite [image range^2]."""
-    return jnp.maximum(jnp.sum(error) / scene.grid.n_pixels, _SMALLEST_ERROR)
+    """Mean over the pixels, by their weights, of errors squared and summed per triangle, floored for its logarithm [image range^2]."""
+    return jnp.maximum(jnp.sum(error) / scene.grid.total, _SMALLEST_ERROR)
 
 
 class SpringLoss(eqx.Module):

@@ -14,7 +14,7 @@ import numpy as np
 from ...images.image import Image
 from ..drawing import canvas_and_figure
 from .fitting import Reconstructed
-from .report import uniform_errors
+from .report import rms, uniform_errors
 from .triangles import corners
 
 DPI = 130
@@ -27,7 +27,7 @@ def draw_pictures(folder: pathlib.Path, image: Image, found: Reconstructed) -> t
         ImportError: matplotlib is not installed.
     """
     canvas, figure_of = canvas_and_figure()
-    values = np.asarray(image.values, np.float64)
+    values = _seen(image)
     left, right, bottom, top = _extent(image)
     width = min(6.0, 4.5 * max((right - left) / (bottom - top), 0.5))
     height = max(width * (bottom - top) / (right - left), 1.0) + 0.7  # inches, with title and labels
@@ -61,6 +61,12 @@ def triangle_corners(flip: np.ndarray) -> np.ndarray:
     return np.stack([np.ravel(corner) for corner in corners(jnp.arange(ny * nx).reshape(ny, nx), jnp.asarray(flip))], axis=-1)
 
 
+def _seen(image: Image) -> np.ndarray:
+    """The pixels, NaN in holes: there the pictures stay empty."""
+    values = np.asarray(image.values, np.float64)
+    return values if image.weights is None else np.where(np.asarray(image.weights) > 0, values, np.nan)
+
+
 def _extent(image: Image) -> tuple[float, float, float, float]:
     """Outer edges of the outermost pixels, for rows that run down."""
     (ny, nx), (sx, sy), (ox, oy) = image.shape, map(float, image.spacing), map(float, image.origin)
@@ -90,7 +96,7 @@ def _meshes(figure: Any, image: Image, values: np.ndarray, found: Reconstructed)
 def _reconstructions(figure: Any, image: Image, values: np.ndarray, surfaces: dict[str, tuple[np.ndarray, np.ndarray]]) -> Any:
     panels = [("image", values), *((f"{name}, best heights", best) for name, (_, best) in surfaces.items())]
     for axes, (title, picture) in zip(figure.subplots(1, 4), panels, strict=True):
-        axes.imshow(picture, cmap="gray", extent=_extent(image), vmin=values.min(), vmax=values.max())
+        axes.imshow(picture, cmap="gray", extent=_extent(image), vmin=np.nanmin(values), vmax=np.nanmax(values))
         axes.set_title(title)
         _label(axes, image)
     figure.colorbar(figure.axes[0].images[0], ax=figure.axes, label="value of the image", fraction=0.03, pad=0.01)
@@ -99,13 +105,13 @@ def _reconstructions(figure: Any, image: Image, values: np.ndarray, surfaces: di
 
 def _errors(figure: Any, image: Image, values: np.ndarray, surfaces: dict[str, tuple[np.ndarray, np.ndarray]]) -> Any:
     """Signed errors under both rules, all on one scale: the 99th percentile of the uniform mesh's."""
-    limit = float(np.percentile(np.abs(surfaces["uniform mesh"][0] - values), 99)) or 1.0
+    limit = float(np.nanpercentile(np.abs(surfaces["uniform mesh"][0] - values), 99)) or 1.0
     rows = figure.subplots(2, 3)
     for rule, (row, label) in enumerate(zip(rows, ("sampled", "best"), strict=True)):
         for axes, (name, pair) in zip(row, surfaces.items(), strict=True):
             error = pair[rule] - values
             axes.imshow(error, cmap="RdBu_r", extent=_extent(image), vmin=-limit, vmax=limit)
-            axes.set_title(f"{name}, {label} heights: rmse {np.sqrt(np.mean(error**2)):.4g}")
+            axes.set_title(f"{name}, {label} heights: rmse {rms(np.nan_to_num(error), image.weights):.4g}")
             _label(axes, image)
     figure.colorbar(figure.axes[0].images[0], ax=figure.axes, label="surface minus image", fraction=0.03, pad=0.01)
     return figure

@@ -14,6 +14,8 @@ Beside springs of stiffness k_z along z, whose Laplacian is L, the mesh comes to
     (N + r L) z = b,    r = k_z / k                                                                               [pixels]
 
 which for small r is the best z that this mesh can have: the least-squares spline. A little of r decides nodes that no pixel holds.
+
+Where pixels have weights, each sum takes every pixel times its weight: its spring is so much stiffer. A hole has weight zero.
 """
 
 from __future__ import annotations
@@ -39,7 +41,7 @@ MIDDLE = 0.5
 
 
 class Moments(eqx.Module):
-    """Sums over the pixels in each triangle, of powers of their position p from the triangle's origin and their value d - MIDDLE.
+    """Sums over the pixels in each triangle, of powers of their position p from the triangle's origin and their value d - MIDDLE, times w.
 
     Attributes:
         sums: n, px, py, px^2, px py, py^2, d, d px, d py, d^2.
@@ -51,12 +53,14 @@ class Moments(eqx.Module):
 
     @staticmethod
     def of(values: Float[Array, " P"], grid: PixelGrid, triangle: Int[Array, " P"], x: Node, y: Node, flip: Flip) -> Moments:
-        """Moments of the pixels `values` held by `triangle`, about the centroids of the triangles."""
+        """Moments of the pixels `values` held by `triangle`, by the weights of the grid, about the centroids of the triangles."""
         shape = (2, *flip.shape)
         ox, oy = _centre(corners(x, flip)), _centre(corners(y, flip))
         px, py = grid.x - read(ox.reshape(-1), triangle), grid.y - read(oy.reshape(-1), triangle)
         d = values - MIDDLE
         features = (jnp.ones_like(d), px, py, px * px, px * py, py * py, d, d * px, d * py, d * d)
+        if grid.weights is not None:
+            features = tuple(grid.weights * feature for feature in features)
         # One scatter of rows is a little faster than ten, and than any sort.
         table = (
             jnp.zeros((ox.size, len(features)), d.dtype)
@@ -67,7 +71,7 @@ class Moments(eqx.Module):
 
     @property
     def count(self) -> PerTriangle:
-        """Number of pixels in each triangle."""
+        """Weight of the pixels in each triangle: their number where they have none."""
         return self.sums[0]
 
     def squared_error(self, x: Node, y: Node, z: Node, flip: Flip) -> PerTriangle:

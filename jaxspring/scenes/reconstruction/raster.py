@@ -34,11 +34,13 @@ class PixelGrid(eqx.Module):
         x: (P,) pixel positions along x, row by row [m].
         y: (P,) along y [m].
         shape: (ny, nx) of the image (static).
+        weights: (P,) how much each pixel counts, 0 in a hole; None where all count alike.
     """
 
     x: Float[Array, " P"]
     y: Float[Array, " P"]
     shape: tuple[int, int] = eqx.field(static=True)
+    weights: Float[Array, " P"] | None = None
 
     @staticmethod
     def of(image: Image) -> PixelGrid:
@@ -46,12 +48,18 @@ class PixelGrid(eqx.Module):
         ny, nx = image.shape
         x = image.origin[0] + image.spacing[0] * jnp.arange(nx, dtype=image.dtype)
         y = image.origin[1] + image.spacing[1] * jnp.arange(ny, dtype=image.dtype)
-        return PixelGrid(jnp.tile(x, ny), jnp.repeat(y, nx), (ny, nx))
+        weights = None if image.weights is None else image.weights.reshape(-1)
+        return PixelGrid(jnp.tile(x, ny), jnp.repeat(y, nx), (ny, nx), weights)
 
     @property
     def n_pixels(self) -> int:
         """Number of pixels P."""
         return self.shape[0] * self.shape[1]
+
+    @property
+    def total(self) -> Array | int:
+        """Sum of the weights: the number of pixels where they have none."""
+        return self.n_pixels if self.weights is None else jnp.sum(self.weights)
 
     def uniform_nodes(self, node_shape: tuple[int, int]) -> tuple[Node, Node]:
         """(x, y) of a regular lattice over the image, its border on the outermost pixels [m]."""
@@ -87,7 +95,7 @@ def locate(x: Node, y: Node, flip: Flip, grid: PixelGrid, triangle: Int[Array, "
     vertices = [c.reshape(-1) for a in (x, y) for c in corners(a, flip)]
     n_triangles = 2 * flip.size
     across = neighbours(flip).reshape(-1)
-    image_area = (grid.x[-1] - grid.x[0]) * (grid.y[-1] - grid.y[0])
+    image_area = (x[-1, -1] - x[0, 0]) * (y[-1, -1] - y[0, 0])
     tolerance = -EDGE_ROUNDING * jnp.finfo(x.dtype).eps * image_area / math.sqrt(flip.size)
     most = WALKS * sum(x.shape)
 

@@ -4,7 +4,10 @@ Two rules for the heights, never compared with each other: `sampled` takes the i
 the mesh. The reference is the bilinear spline on the regular grid with as many nodes: the stricter one, as the same nodes joined by
 triangles do worse.
 
-Errors are taken from the drawn surface, pixel by pixel in double precision, not from the sums that the fit uses.
+Errors are taken from the drawn surface, pixel by pixel in double precision, not from the sums that the fit uses. Where pixels have
+weights w they are sqrt(sum w e^2 / sum w): over the pixels that have data, where the weights are ones and zeros.
+
+With holes the best heights are solved exactly: the error of an iterative solve hides where only the weak springs along z hold a node.
 """
 
 from __future__ import annotations
@@ -17,8 +20,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from ...linalg.cg import JaxCG
-from .loss import Carried, SurfaceError, choose_diagonals
+from .loss import MEMBRANE, Carried, SurfaceError, choose_diagonals
 from .pixels import Moments, best_height
+from .posterior import LONGEST_ROW, exact_height
 from .raster import draw, locate
 from .scene import Reconstruction
 from .triangles import Node, count_folds
@@ -28,7 +32,7 @@ _SOLVER = JaxCG(tolerance=1e-5)
 
 
 class Errors(NamedTuple):
-    """Root mean square errors under the two rules, in the image's unit."""
+    """Root mean square errors under the two rules, by the pixels' weights, in the image's unit."""
 
     sampled: float
     best: float
@@ -45,6 +49,8 @@ class Surface(NamedTuple):
         rmse: their errors.
         folds: triangles folded over.
         outside: pixels in no triangle.
+        unreached: (ny, nx) nodes that no datum decides: the springs of the pixels around them weigh less than one spring along z, so that
+            their heights come from their neighbours. None where the image has no weights.
     """
 
     x: np.ndarray
@@ -57,6 +63,7 @@ class Surface(NamedTuple):
     rmse: Errors
     folds: int
     outside: int
+    unreached: np.ndarray | None = None
 
 
 def measure(error: SurfaceError, carried: Carried, diagonals: bool = True) -> Surface:
@@ -64,23 +71,41 @@ def measure(error: SurfaceError, carried: Carried, diagonals: bool = True) -> Su
     scene = error.scene
     if diagonals:
         carried = _choose(error, carried)
-    z_sampled, z_best, sampled, best, folds, lost = _draw_both(error, carried)
+    z_sampled, z_best, sampled, best, folds, lost, unreached = _draw_both(error, carried)
     truth = _own_unit(scene, scene.image.values)
     sampled, best, z_sampled, z_best = (_own_unit(scene, a) for a in (sampled, best, z_sampled, z_best))
-    rmse = Errors(_rms(sampled - truth), _rms(best - truth))
+    rmse = Errors(*(rms(drawn - truth, scene.image.weights) for drawn in (sampled, best)))
     x, y, flip = (np.asarray(a) for a in (carried.x, carried.y, carried.flip))
-    return Surface(x, y, flip, z_sampled, z_best, sampled, best, rmse, int(folds), int(lost))
+    return Surface(x, y, flip, z_sampled, z_best, sampled, best, rmse, int(folds), int(lost), _host(unreached))
 
 
 def uniform_errors(scene: Reconstruction) -> tuple[Errors, np.ndarray, np.ndarray]:
     """Errors of the bilinear spline on the regular grid, and the two images it makes (sampled, best), in the image's unit."""
+    weights = scene.image.weights
     truth = _own_unit(scene, scene.image.values)
     rows, columns = (_hats(n, p) for n, p in zip(scene.net.shape, truth.shape, strict=True))
     at_nodes = _own_unit(scene, scene.image.sample(scene.rest.x, scene.rest.y))
     sampled = rows @ at_nodes @ columns.T
-    # Least squares for a tensor product of hats: along each axis by itself.
-    best = rows @ (np.linalg.pinv(rows) @ truth @ np.linalg.pinv(columns).T) @ columns.T
-    return Errors(_rms(sampled - truth), _rms(best - truth)), sampled, best
+    if weights is None:
+        # Least squares for a tensor product of hats: along each axis by itself.
+        best = rows @ (np.linalg.pinv(rows) @ truth @ np.linalg.pinv(columns).T) @ columns.T
+    else:
+        best = rows @ _weighted_spline(rows, columns, truth, np.asarray(weights, np.float64)) @ columns.T
+    return Errors(rms(sampled - truth, weights), rms(best - truth, weights)), sampled, best
+
+
+def _weighted_spline(rows: np.ndarray, columns: np.ndarray, truth: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """(ny, nx) heights of the bilinear spline that minimise the weighted squares and the same little membrane energy as the meshes'."""
+    from scipy import sparse
+    from scipy.sparse.linalg import spsolve
+
+    (_, ny), (_, nx) = rows.shape, columns.shape
+    hats = sparse.kron(sparse.csr_array(rows), sparse.csr_array(columns)).tocsr()
+    apart = [sparse.eye_array(n - 1, n, k=1) - sparse.eye_array(n - 1, n) for n in (ny, nx)]
+    laplacian = sparse.kron(apart[0].T @ apart[0], sparse.eye_array(nx)) + sparse.kron(sparse.eye_array(ny), apart[1].T @ apart[1])
+    w = weights.ravel()
+    matrix = hats.T @ (w[:, None] * hats) + MEMBRANE * w.sum() / (ny * nx) * laplacian
+    return np.asarray(spsolve(sparse.csc_array(matrix), hats.T @ (w * truth.ravel()))).reshape(ny, nx)
 
 
 @eqx.filter_jit
@@ -89,23 +114,34 @@ def _choose(error: SurfaceError, carried: Carried) -> Carried:
 
 
 @eqx.filter_jit
-def _draw_both(error: SurfaceError, carried: Carried) -> tuple[Node, Node, Node, Node, jax.Array, jax.Array]:
+def _draw_both(error: SurfaceError, carried: Carried) -> tuple[Node, Node, Node, Node, jax.Array, jax.Array, jax.Array | None]:
     scene, x, y, flip = error.scene, carried.x, carried.y, carried.flip
     location = locate(x, y, flip, scene.grid, carried.triangle)
     moments = Moments.of(scene.image.values.reshape(-1), scene.grid, location.triangle, x, y, flip)
-    ratio = jnp.asarray(error.membrane * scene.grid.n_pixels / scene.net.n_nodes, x.dtype)
-    best, _ = best_height(moments.normal_equations(x, y, flip), scene.net, ratio, carried.z, _SOLVER)
+    equations, ratio, unreached = moments.normal_equations(x, y, flip), jnp.asarray(error.ratio, x.dtype), None
+    if scene.grid.weights is None or x.shape[1] > LONGEST_ROW:
+        best, _ = best_height(equations, scene.net, ratio, carried.z, _SOLVER)
+    else:
+        best, _ = exact_height(equations, ratio)
+    if scene.grid.weights is not None:
+        unreached = equations.diagonal() < ratio
     sampled = scene.image.sample(x, y)
     drawn = [draw(x, y, z, flip, scene.grid, location.triangle) for z in (sampled, best)]
-    return sampled, best, drawn[0], drawn[1], count_folds(x, y, flip), location.n_lost
+    return sampled, best, drawn[0], drawn[1], count_folds(x, y, flip), location.n_lost, unreached
 
 
 def _own_unit(scene: Reconstruction, scaled: jax.Array) -> np.ndarray:
     return float(scene.low) + float(scene.extent) * np.asarray(scaled, np.float64)
 
 
-def _rms(difference: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(difference**2)))
+def _host(mask: jax.Array | None) -> np.ndarray | None:
+    return None if mask is None else np.asarray(mask)
+
+
+def rms(difference: np.ndarray, weights: jax.Array | None) -> float:
+    """Root mean square of a difference `(ny, nx)`, by the weights of the pixels."""
+    of_pixel = None if weights is None else np.asarray(weights, np.float64)
+    return float(np.sqrt(np.average(difference**2, weights=of_pixel)))
 
 
 def _hats(n_nodes: int, n_pixels: int) -> np.ndarray:

@@ -50,7 +50,7 @@ class Reconstruction(eqx.Module):
     """An image and the lattice that is to recover it.
 
     Args:
-        image: the data, in any unit.
+        image: the data, in any unit; holes count nowhere, and weights in every error and data spring.
         nodes: (ny, nx), nodes of the lattice along y and along x.
 
     Attributes:

@@ -163,6 +163,9 @@ PUBLIC: dict[str, dict[str, tuple[str, ...]]] = {
         "scenes.reconstruction.pixels": ("PixelSprings",),
         "scenes.reconstruction.fitting": ("Reconstructed", "SpringSettings", "fit_springs"),
         "scenes.reconstruction.constants": ("ConstantsSettings", "fit_constants"),
+        "scenes.reconstruction.breaks": ("Breaks", "find_breaks", "step_stiffness"),
+        "scenes.reconstruction.pieces": ("BrokenSurface", "break_surface"),
+        "scenes.reconstruction.tin": ("SurfaceErrors", "Tin", "fitted_tin"),
     },
     "robot": {
         "forces.actuation": ("Actuation",),

@@ -15,5 +15,13 @@ if TYPE_CHECKING:  # written by `python -m tests.face`
     from .scenes.reconstruction.fitting import fit_springs as fit_springs
     from .scenes.reconstruction.constants import ConstantsSettings as ConstantsSettings
     from .scenes.reconstruction.constants import fit_constants as fit_constants
+    from .scenes.reconstruction.breaks import Breaks as Breaks
+    from .scenes.reconstruction.breaks import find_breaks as find_breaks
+    from .scenes.reconstruction.breaks import step_stiffness as step_stiffness
+    from .scenes.reconstruction.pieces import BrokenSurface as BrokenSurface
+    from .scenes.reconstruction.pieces import break_surface as break_surface
+    from .scenes.reconstruction.tin import SurfaceErrors as SurfaceErrors
+    from .scenes.reconstruction.tin import Tin as Tin
+    from .scenes.reconstruction.tin import fitted_tin as fitted_tin
 else:
     __all__, __getattr__, __dir__ = _face(__name__)

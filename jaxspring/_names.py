@@ -166,6 +166,7 @@ PUBLIC: dict[str, dict[str, tuple[str, ...]]] = {
         "scenes.reconstruction.breaks": ("Breaks", "find_breaks", "step_stiffness"),
         "scenes.reconstruction.pieces": ("BrokenSurface", "break_surface"),
         "scenes.reconstruction.tin": ("SurfaceErrors", "Tin", "fitted_tin"),
+        "scenes.reconstruction.refine": ("Subdivision",),
     },
     "robot": {
         "forces.actuation": ("Actuation",),

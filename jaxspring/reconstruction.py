@@ -23,5 +23,6 @@ if TYPE_CHECKING:  # written by `python -m tests.face`
     from .scenes.reconstruction.tin import SurfaceErrors as SurfaceErrors
     from .scenes.reconstruction.tin import Tin as Tin
     from .scenes.reconstruction.tin import fitted_tin as fitted_tin
+    from .scenes.reconstruction.refine import Subdivision as Subdivision
 else:
     __all__, __getattr__, __dir__ = _face(__name__)

@@ -167,6 +167,8 @@ PUBLIC: dict[str, dict[str, tuple[str, ...]]] = {
         "scenes.reconstruction.pieces": ("BrokenSurface", "break_surface"),
         "scenes.reconstruction.tin": ("SurfaceErrors", "Tin", "fitted_tin"),
         "scenes.reconstruction.refine": ("Subdivision",),
+        "scenes.reconstruction.bounded": ("BoundedSurface", "bound_error"),
+        "scenes.reconstruction.tin_files": ("save_tin",),
     },
     "robot": {
         "forces.actuation": ("Actuation",),

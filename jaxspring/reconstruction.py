@@ -24,5 +24,8 @@ if TYPE_CHECKING:  # written by `python -m tests.face`
     from .scenes.reconstruction.tin import Tin as Tin
     from .scenes.reconstruction.tin import fitted_tin as fitted_tin
     from .scenes.reconstruction.refine import Subdivision as Subdivision
+    from .scenes.reconstruction.bounded import BoundedSurface as BoundedSurface
+    from .scenes.reconstruction.bounded import bound_error as bound_error
+    from .scenes.reconstruction.tin_files import save_tin as save_tin
 else:
     __all__, __getattr__, __dir__ = _face(__name__)

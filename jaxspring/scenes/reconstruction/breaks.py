@@ -56,7 +56,7 @@ def step_stiffness(stiffness: Numbers, data_stiffness: Numbers) -> Array:
         ValueError: a negative stiffness, or shapes that differ.
 
     >>> print(step_stiffness(1.0, 0.01).round(4))
-    0.0475
+    0.0499
     """
     k, kd = as_inexact("stiffness", stiffness), as_inexact("data_stiffness", data_stiffness)
     for name, value in (("stiffness", k), ("data_stiffness", kd)):

@@ -18,7 +18,7 @@ from ..._checks import finite, has_shape, positive, triangle_indices
 from ...images.image import Image
 from ...topology.builders import from_triangles
 from .breaks import Breaks, find_breaks
-from .tin import Located, Tin, least_squares, locate_pixels, surface_matrix
+from .tin import Located, Tin, fitted_heights, locate_pixels, surface_matrix
 
 # Springs along z over a node's data spring, while breaks are looked for.
 SMOOTHING = 1.0
@@ -65,10 +65,9 @@ def break_surface(image: Image, points: Numbers, triangles: Numbers, step: float
     >>> import jaxspring as js
     >>> y, x = np.mgrid[:40, :40]
     >>> image = js.Image(np.where(x > 17, 1.0, 0.0))
-    >>> net = js.delaunay(np.stack(np.meshgrid(np.linspace(0, 39, 6), np.linspace(0, 39, 6)), axis=-1).reshape(-1, 2))
-    >>> places = np.stack(np.meshgrid(np.linspace(0, 39, 6), np.linspace(0, 39, 6)), axis=-1).reshape(-1, 2)
-    >>> found = break_surface(image, places, net.triangles, step=0.5)
-    >>> bool(found.rmse < found.unbroken.errors(image).rmse / 3)
+    >>> places = np.stack(np.meshgrid(np.linspace(0, 39, 11), np.linspace(0, 39, 11)), axis=-1).reshape(-1, 2)
+    >>> found = break_surface(image, places, js.delaunay(places).triangles, step=0.5)
+    >>> bool(found.rmse < found.unbroken.errors(image).rmse / 2)
     True
     """
     places = on_host("points", points).astype(np.float64)
@@ -81,12 +80,12 @@ def break_surface(image: Image, points: Numbers, triangles: Numbers, step: float
     net, truth = from_triangles(corners, len(places)), np.asarray(image.values, np.float64).ravel()
     located = locate_pixels(image, places, corners)
     matrix = surface_matrix(located, corners, len(places))
-    whole = Tin(np.column_stack([places, least_squares(matrix, truth, net)]), corners)
+    whole = Tin(np.column_stack([places, fitted_heights(matrix, truth, net)]), corners)
     number = np.asarray(matrix.sum(axis=0)).ravel()
     data = np.asarray(image.sample(places[:, 0], places[:, 1]), np.float64)
     breaks = find_breaks(net, places, data, smoothing * float(np.median(number[number > 0])), number, step, image)
     sided = surface_matrix(sided_weights(located, corners, np.asarray(net.edges), breaks), corners, len(places))
-    z = least_squares(sided, truth, net, ~breaks.broken)
+    z = fitted_heights(sided, truth, net, ~breaks.broken)
     drawn = np.where(located.triangle < 0, np.nan, sided @ z)
     error = np.abs(drawn - truth)
     rmse, greatest = float(np.sqrt(np.nanmean(error**2))), float(np.nanmax(error))

@@ -84,14 +84,14 @@ class Built:
     @staticmethod
     def closed(roots: np.ndarray, n_roots: int, red: tuple[np.ndarray, ...]) -> Built:
         """With all that must be split as well, so that no triangle has more than one split side, once."""
-        red = list(red)
+        split = list(red)
         while True:
-            built = Built.of(roots, n_roots, red)
+            built = Built.of(roots, n_roots, split)
             missing = built._missing()
             if not any(map(len, missing)):
                 return built
-            red += [np.zeros(0, np.int64)] * (len(missing) - len(red))
-            red = [np.union1d(old, new) for old, new in zip(red, missing, strict=True)]
+            split += [np.zeros(0, np.int64)] * (len(missing) - len(split))
+            split = [np.union1d(old, new) for old, new in zip(split, missing, strict=True)]
 
     @property
     def n_nodes(self) -> int:

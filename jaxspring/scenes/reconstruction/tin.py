@@ -85,7 +85,7 @@ def surface_matrix(located: Located, triangles: np.ndarray, n_nodes: int) -> Any
     return csr_array((located.weights[inside].ravel(), (rows, columns)), shape=(len(located.triangle), n_nodes))
 
 
-def least_squares(matrix: Any, data: np.ndarray, net: Graph, whole: np.ndarray | None = None, membrane: float = MEMBRANE) -> np.ndarray:
+def fitted_heights(matrix: Any, data: np.ndarray, net: Graph, whole: np.ndarray | None = None, membrane: float = MEMBRANE) -> np.ndarray:
     """(N,) heights nearest to the pixels `data` (P,), with a little membrane along the springs that are whole."""
     from scipy.sparse import csr_array, diags_array
     from scipy.sparse.linalg import splu
@@ -158,7 +158,7 @@ def fitted_tin(image: Image, points: np.ndarray, triangles: np.ndarray) -> Tin:
     """The TIN over these nodes (N, 2) and triangles with the heights that fit all pixels best."""
     located = locate_pixels(image, points, triangles)
     matrix = surface_matrix(located, triangles, len(points))
-    z = least_squares(matrix, np.asarray(image.values, np.float64).ravel(), from_triangles(triangles, len(points)))
+    z = fitted_heights(matrix, np.asarray(image.values, np.float64).ravel(), from_triangles(triangles, len(points)))
     return Tin(np.column_stack([points[:, :2], z]), triangles)
 
 
@@ -175,4 +175,4 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
-__all__ = ["Located", "SurfaceErrors", "Tin", "fitted_tin", "least_squares", "locate_pixels", "surface_matrix"]
+__all__ = ["Located", "SurfaceErrors", "Tin", "fitted_heights", "fitted_tin", "locate_pixels", "surface_matrix"]

@@ -169,6 +169,11 @@ PUBLIC: dict[str, dict[str, tuple[str, ...]]] = {
         "scenes.reconstruction.refine": ("Subdivision",),
         "scenes.reconstruction.bounded": ("BoundedSurface", "bound_error"),
         "scenes.reconstruction.tin_files": ("save_tin",),
+        "scenes.reconstruction.border": ("SlidingBorder",),
+        "scenes.reconstruction.planar": ("PlanarFit", "PlanarSettings", "fit_triangles"),
+        "scenes.reconstruction.refined": ("Refined", "refine_by_error"),
+        "scenes.reconstruction.shell": ("Shell", "fit_shell", "icosahedron"),
+        "scenes.reconstruction.contour": ("active_contour",),
     },
     "robot": {
         "forces.actuation": ("Actuation",),

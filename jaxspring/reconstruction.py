@@ -27,5 +27,15 @@ if TYPE_CHECKING:  # written by `python -m tests.face`
     from .scenes.reconstruction.bounded import BoundedSurface as BoundedSurface
     from .scenes.reconstruction.bounded import bound_error as bound_error
     from .scenes.reconstruction.tin_files import save_tin as save_tin
+    from .scenes.reconstruction.border import SlidingBorder as SlidingBorder
+    from .scenes.reconstruction.planar import PlanarFit as PlanarFit
+    from .scenes.reconstruction.planar import PlanarSettings as PlanarSettings
+    from .scenes.reconstruction.planar import fit_triangles as fit_triangles
+    from .scenes.reconstruction.refined import Refined as Refined
+    from .scenes.reconstruction.refined import refine_by_error as refine_by_error
+    from .scenes.reconstruction.shell import Shell as Shell
+    from .scenes.reconstruction.shell import fit_shell as fit_shell
+    from .scenes.reconstruction.shell import icosahedron as icosahedron
+    from .scenes.reconstruction.contour import active_contour as active_contour
 else:
     __all__, __getattr__, __dir__ = _face(__name__)

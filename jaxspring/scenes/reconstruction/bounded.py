@@ -10,9 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..._arrays import Numbers, on_host
-from ..._checks import finite, positive, triangle_indices
+from ..._arrays import Numbers
+from ..._checks import triangle_indices
 from ...images.image import Image
+from .given import host_number, plane_points
 from .refine import Subdivision
 from .tin import Tin, fitted_heights, locate_pixels, surface_matrix
 
@@ -38,7 +39,7 @@ class BoundedSurface:
     worst: tuple[int, int]
 
 
-def bound_error(image: Image, points: Numbers, triangles: Numbers, bound: float, most: int | None = None) -> BoundedSurface:
+def bound_error(image: Image, points: Numbers, triangles: Numbers, bound: Numbers, most: int | None = None) -> BoundedSurface:
     """Split triangles until no pixel is farther from the surface than a bound.
 
     Args:
@@ -59,12 +60,9 @@ def bound_error(image: Image, points: Numbers, triangles: Numbers, bound: float,
     >>> found.holds, found.greatest < 5, len(found.tin.points) < 100
     (True, True, True)
     """
-    places = on_host("points", points).astype(np.float64)
-    if places.ndim != 2 or places.shape[1] not in (2, 3):
-        raise ValueError(f"points has shape {places.shape}; expected (N, 2) or (N, 3).")
-    finite("points", places)
-    places, corners = places[:, :2], triangle_indices("triangles", triangles, len(places))
-    positive("bound", bound, "No surface of triangles has no error at all.")
+    places = plane_points(points)
+    corners = triangle_indices("triangles", triangles, len(places))
+    limit = host_number("bound", bound, "No surface of triangles has no error at all.")
     base = mesh = Subdivision.of(corners, len(places))
     most, truth, n_splits = image.values.size if most is None else most, np.asarray(image.values, np.float64).ravel(), 0
     while True:
@@ -75,7 +73,7 @@ def bound_error(image: Image, points: Numbers, triangles: Numbers, bound: float,
         error = np.where(located.triangle < 0, 0.0, np.abs(matrix @ z - truth))
         greatest = np.zeros(len(mesh.triangles))
         np.maximum.at(greatest, np.maximum(located.triangle, 0), error)
-        finer = mesh.refined(greatest > bound) if error.max() > bound else mesh
+        finer = mesh.refined(greatest > limit) if error.max() > limit else mesh
         if finer is mesh or finer.n_nodes > most:
             worst = divmod(int(error.argmax()), image.shape[1])
             rmse = float(np.sqrt(np.mean(error[located.triangle >= 0] ** 2)))

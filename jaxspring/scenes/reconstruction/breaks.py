@@ -26,11 +26,12 @@ import numpy as np
 from jaxtyping import Array
 
 from ..._arrays import Numbers
-from ..._checks import as_inexact, has_shape, nonnegative, positive
+from ..._checks import as_inexact, has_shape, nonnegative
 from ...topology.base import Topology
 from ...topology.edge_field import EdgeField
 from .break_energy import LOOSE, Fitted, HeightField
 from .break_lines import Faces, locate_breaks, trace
+from .given import host_number
 
 # Lines begin where a step of so many times the wanted one shows, then of less.
 STAGES = (4.0, 2.0, 1.0)
@@ -111,7 +112,7 @@ def find_breaks(
     data: Numbers,
     stiffness: Numbers,
     data_stiffness: Numbers,
-    step: float,
+    step: Numbers,
     image: Any = None,
 ) -> Breaks:
     """Break the springs of a height field where its energy falls by more than the price of a step, strongest edges first.
@@ -146,12 +147,12 @@ def find_breaks(
     (4, [3.5, 1.0], 0.078)
     """
     field = HeightField.of(net, points, data, stiffness, data_stiffness)
-    positive("step", step, "Every spring would break.")
+    lowest = host_number("step", step, "Every spring would break.")
     faces = Faces.of(net)
     ends = field.edges
     both = 0.5 * (field.data_stiffness[ends[:, 0]] + field.data_stiffness[ends[:, 1]])
     chain = np.asarray(step_stiffness(field.stiffness, both), np.float64)
-    price = 0.5 * chain * step**2
+    price = 0.5 * chain * lowest**2
     allowed = ~faces.ring & (field.stiffness > 0)
     broken = np.zeros(len(ends), bool)
     for factor in STAGES:
@@ -161,7 +162,7 @@ def find_breaks(
     fraction = locate_breaks(image, field.points, ends, broken)
     lines = trace(faces, field.points, ends, broken, fraction)
     with np.errstate(divide="ignore", invalid="ignore"):
-        slope = np.where(field.stiffness > 0, step * chain / field.stiffness, np.inf)
+        slope = np.where(field.stiffness > 0, lowest * chain / field.stiffness, np.inf)
     gain = before.energy - fit.energy
     return Breaks(net, field.points, broken, fit.z, fraction, lines, gain, float(price[broken].sum()), float(slope.min()))
 

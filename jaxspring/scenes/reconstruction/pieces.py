@@ -13,11 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..._arrays import Numbers, on_host
-from ..._checks import finite, has_shape, positive, triangle_indices
+from ..._arrays import Numbers
+from ..._checks import triangle_indices
 from ...images.image import Image
 from ...topology.builders import from_triangles
 from .breaks import Breaks, find_breaks
+from .given import host_number, plane_points
 from .tin import Located, Tin, fitted_heights, locate_pixels, surface_matrix
 
 # Springs along z over a node's data spring, while breaks are looked for.
@@ -45,7 +46,7 @@ class BrokenSurface:
     greatest: float
 
 
-def break_surface(image: Image, points: Numbers, triangles: Numbers, step: float, smoothing: float = SMOOTHING) -> BrokenSurface:
+def break_surface(image: Image, points: Numbers, triangles: Numbers, step: Numbers, smoothing: Numbers = SMOOTHING) -> BrokenSurface:
     """Break a surface of triangles over an image along its edges, and fit both sides of each.
 
     Args:
@@ -70,20 +71,16 @@ def break_surface(image: Image, points: Numbers, triangles: Numbers, step: float
     >>> bool(found.rmse < found.unbroken.errors(image).rmse / 2)
     True
     """
-    places = on_host("points", points).astype(np.float64)
-    if places.ndim != 2 or places.shape[1] not in (2, 3):
-        raise ValueError(f"points has shape {places.shape}; expected (N, 2) or (N, 3).")
-    finite("points", places)
-    places, corners = places[:, :2], triangle_indices("triangles", triangles, len(places))
-    positive("smoothing", smoothing, "Nothing would hold the surface together.")
-    has_shape("smoothing", smoothing, {"one number": ()})
+    places = plane_points(points)
+    corners = triangle_indices("triangles", triangles, len(places))
+    ratio = host_number("smoothing", smoothing, "Nothing would hold the surface together.")
     net, truth = from_triangles(corners, len(places)), np.asarray(image.values, np.float64).ravel()
     located = locate_pixels(image, places, corners)
     matrix = surface_matrix(located, corners, len(places))
     whole = Tin(np.column_stack([places, fitted_heights(matrix, truth, net)]), corners)
     number = np.asarray(matrix.sum(axis=0)).ravel()
     data = np.asarray(image.sample(places[:, 0], places[:, 1]), np.float64)
-    breaks = find_breaks(net, places, data, smoothing * float(np.median(number[number > 0])), number, step, image)
+    breaks = find_breaks(net, places, data, ratio * float(np.median(number[number > 0])), number, step, image)
     sided = surface_matrix(sided_weights(located, corners, np.asarray(net.edges), breaks), corners, len(places))
     z = fitted_heights(sided, truth, net, ~breaks.broken)
     drawn = np.where(located.triangle < 0, np.nan, sided @ z)

@@ -85,11 +85,25 @@ def locate(x: Node, y: Node, flip: Flip, grid: PixelGrid, triangle: Int[Array, "
     """Triangles that hold the pixels, walking from those in `triangle`. Not differentiated: where a derivative exists, it is constant."""
     x, y = lax.stop_gradient((x, y))
     vertices = [c.reshape(-1) for a in (x, y) for c in corners(a, flip)]
-    n_triangles = 2 * flip.size
-    across = neighbours(flip).reshape(-1)
+    return walk(vertices, neighbours(flip).reshape(-1), grid, triangle, flip.size, WALKS * sum(x.shape))
+
+
+def walk(
+    vertices: list[Array], across: Int[Array, " T3"], grid: PixelGrid, triangle: Int[Array, " P"], n_cells: int, most: int
+) -> Location:
+    """The walk through any triangles.
+
+    Args:
+        vertices: x of the corners a, b and c of each triangle, (T,) each, then y.
+        across: (3 T,) the triangle across the side opposite to a, of all triangles, then to b, then to c.
+        grid: the pixels.
+        triangle: where each walk starts.
+        n_cells: cells that the image falls into, about: for the rounding of areas.
+        most: steps at most.
+    """
+    n_triangles = vertices[0].shape[0]
     image_area = (grid.x[-1] - grid.x[0]) * (grid.y[-1] - grid.y[0])
-    tolerance = -EDGE_ROUNDING * jnp.finfo(x.dtype).eps * image_area / math.sqrt(flip.size)
-    most = WALKS * sum(x.shape)
+    tolerance = -EDGE_ROUNDING * jnp.finfo(vertices[0].dtype).eps * image_area / math.sqrt(n_cells)
 
     def step(walk: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
         triangle, _, _, n = walk

@@ -13,9 +13,12 @@ from typing import Any
 
 import numpy as np
 
+from ..._arrays import Numbers, on_host
+from ..._checks import finite, triangle_indices
 from ...images.image import Image
 from ...topology.builders import from_triangles
 from ...topology.graph import Graph
+from .given import plane_points
 
 # Within so much of its edges a pixel counts as inside a triangle, in barycentric coordinates.
 EDGE = 1e-9
@@ -116,6 +119,15 @@ class Tin:
     points: np.ndarray
     triangles: np.ndarray
 
+    def __post_init__(self):
+        """Own both arrays."""
+        points = on_host("points", self.points).astype(np.float64)
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise ValueError(f"points has shape {points.shape}; expected (N, 3).")
+        finite("points", points)
+        object.__setattr__(self, "points", points)
+        object.__setattr__(self, "triangles", triangle_indices("triangles", self.triangles, len(points)).copy())
+
     @property
     def net(self) -> Graph:
         """A spring along every side."""
@@ -154,12 +166,27 @@ class SurfaceErrors:
     outside: int
 
 
-def fitted_tin(image: Image, points: np.ndarray, triangles: np.ndarray) -> Tin:
-    """The TIN over these nodes (N, 2) and triangles with the heights that fit all pixels best."""
-    located = locate_pixels(image, points, triangles)
-    matrix = surface_matrix(located, triangles, len(points))
-    z = fitted_heights(matrix, np.asarray(image.values, np.float64).ravel(), from_triangles(triangles, len(points)))
-    return Tin(np.column_stack([points[:, :2], z]), triangles)
+def fitted_tin(image: Image, points: Numbers, triangles: Numbers) -> Tin:
+    """The TIN with the heights that fit all pixels best.
+
+    Args:
+        image: the data.
+        points: (N, 2) or (N, 3) nodes in the unit of the image's spacing; x and y are read.
+        triangles: (T, 3) node numbers.
+
+    Raises:
+        ValueError: triangles that do not fit the points.
+
+    >>> y, x = np.mgrid[:8, :8]
+    >>> tin = fitted_tin(Image(2.0 * x + y), [(0, 0), (7, 0), (0, 7), (7, 7)], [(0, 1, 2), (2, 1, 3)])
+    >>> print(tin.points[:, 2].round(2), tin.errors(Image(2.0 * x + y)).folds)
+    [ 0. 14.  7. 21.] 0
+    """
+    places = plane_points(points)
+    corners = triangle_indices("triangles", triangles, len(places))
+    matrix = surface_matrix(locate_pixels(image, places, corners), corners, len(places))
+    z = fitted_heights(matrix, np.asarray(image.values, np.float64).ravel(), from_triangles(corners, len(places)))
+    return Tin(np.column_stack([places, z]), corners)
 
 
 def _areas_and_angle(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, float]:

@@ -172,6 +172,7 @@ PUBLIC: dict[str, dict[str, tuple[str, ...]]] = {
         "scenes.reconstruction.border": ("SlidingBorder",),
         "scenes.reconstruction.planar": ("PlanarFit", "PlanarSettings", "fit_triangles"),
         "scenes.reconstruction.refined": ("Refined", "refine_by_error"),
+        "scenes.reconstruction.swaps": ("swap_sides",),
         "scenes.reconstruction.shell": ("Shell", "fit_shell", "icosahedron"),
         "scenes.reconstruction.contour": ("active_contour",),
     },

@@ -33,6 +33,7 @@ if TYPE_CHECKING:  # written by `python -m tests.face`
     from .scenes.reconstruction.planar import fit_triangles as fit_triangles
     from .scenes.reconstruction.refined import Refined as Refined
     from .scenes.reconstruction.refined import refine_by_error as refine_by_error
+    from .scenes.reconstruction.swaps import swap_sides as swap_sides
     from .scenes.reconstruction.shell import Shell as Shell
     from .scenes.reconstruction.shell import fit_shell as fit_shell
     from .scenes.reconstruction.shell import icosahedron as icosahedron

@@ -435,7 +435,7 @@ NO_ARRAYS = """
     disc distance domain drape_coefficient elevation_model energy_ledger equilibrium fit_constants fit_springs flag
     from_mesh gradient_magnitude hanging impulses load load_image melted_fraction normal_modes on_ball on_table
     pad_nets principal_curvatures push_out raise_for_status rectangle save save_trajectory select smoothing_radius
-    stable_dt total_heat train walk
+    stable_dt swap_sides total_heat train walk
 """
 
 

@@ -25,10 +25,10 @@ def holed():
 
 
 @pytest.fixture
-def image(rng):
-    """A disc with a soft edge."""
+def image():
+    """A disc with a soft edge; no pixel lies on a side of a triangle, where the error has a kink."""
     y, x = np.mgrid[:48, :60]
-    return js.Image(1 / (1 + np.exp(np.hypot(x - 38, y - 22) - 12)))
+    return js.Image(1 / (1 + np.exp(np.hypot(x - 38, y - 22) - 12)), origin=(0.137, 0.211))
 
 
 def beyond(points, places, sides):
@@ -68,8 +68,9 @@ def test_borders_slide_along_a_polygon_and_its_hole(rng):
 @pytest.mark.slow
 def test_a_mesh_of_cotangents_rests_as_it_is(image):
     """Nothing but the image moves the first mesh, however irregular; right angles get a little stiffness."""
-    net, points = js.cloth.rectangle(59.0, 47.0, 6.0)
-    points = points[:, :2] + 0.5 * np.sin(points[:, 1::-1]) * (np.abs(points[:, :2] - [29.5, 23.5]) < [29, 23])
+    net, points = js.cloth.rectangle(58.0, 46.0, 6.0)
+    points = points + 0.5
+    points = points[:, :2] + 0.5 * np.sin(points[:, 1::-1]) * (np.abs(points[:, :2] - [29.5, 23.5]) < [28.9, 22.9])
     scene = PlanarScene(image, points, net.triangles)
     end = jax.jit(lambda: scene.relax(scene.shape, scene.rest, Relaxation(500, 1.0, 0.1)).state.points)()
     np.testing.assert_allclose(end, points, atol=1e-9)
@@ -82,7 +83,8 @@ def test_a_mesh_of_cotangents_rests_as_it_is(image):
 @pytest.mark.slow
 def test_error_and_gradient_of_a_fit(image, rng):
     """The loss is that of every pixel, its gradient that of central differences; a fit lowers the error, without folds."""
-    points, triangles = holed()
+    net, points = js.cloth.outline(HEXAGON, 4.0)  # convex: there nothing folds
+    points, triangles = points[:, :2], net.triangles
     scene = PlanarScene(image, points, triangles)
     start = begin(scene, scene.rest)
     loss = PlanarLoss(scene, jnp.log(scene.shape), Relaxation(10, 1.0, 0.1), solver=JaxCG(tolerance=1e-12))
@@ -109,7 +111,7 @@ def test_error_and_gradient_of_a_fit(image, rng):
     before = js.reconstruction.fitted_tin(image, points, triangles).errors(image)
     after = fitted.tin.errors(image)
     assert after.rmse < before.rmse / 1.2
-    assert after.folds == 0
+    assert after.folds == int(folds) == 0
     assert abs(after.outside - before.outside) <= 3
 
 
@@ -134,5 +136,5 @@ def test_triangles_that_are_no_surface_are_refused(image):
     points = np.array([[0.0, 0], [1, 0], [0, 1], [1, 1], [2, 2]])
     with pytest.raises(ValueError, match="more than two triangles"):
         PlanarScene(image, points, [[0, 1, 2], [1, 2, 3], [1, 2, 4]])
-    with pytest.raises(ValueError, match="points has shape"):
+    with pytest.raises(ValueError, match="the net has 3 nodes"):
         js.reconstruction.SlidingBorder(js.from_triangles([[0, 1, 2]], 3), np.zeros((2, 2)))

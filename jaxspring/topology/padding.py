@@ -161,11 +161,7 @@ def pad_nets(nets: Sequence[Graph], capacity: tuple[int, int, int] | None = None
         count=len(falling),
         nodes=Permutation(np.arange(len(falling))),
         springs=Permutation(np.arange(n_springs)),
-        digest=digest_of(
-            np.concatenate([np.concatenate([p, [[net.n_nodes, -1]]]) for net, p in zip(nets, pairs, strict=True)])
-            if capacity is None
-            else np.array([[-1, -1], [len(nets), -1], [*capacity[:2]], [capacity[2], -1]])
-        ),
+        digest=_digest(nets, pairs, capacity),
         name=None,
     )
     nodes, springs = tuple(p for _, p, _, _ in made), tuple(s for *_, s, _ in made)
@@ -184,6 +180,13 @@ def _check(nets: list[Any]) -> None:
             raise ValueError(f"nets[{b}] has no spring.")
         if (net.box is None) != (nets[0].box is None) or (net.box is not None and net.box.shape != nets[0].box.shape):
             raise ValueError(f"nets[{b}] and nets[0] have not the same periodic coordinates; all nets of a batch have, or none.")
+
+
+def _digest(nets: list[Any], pairs: list[np.ndarray], capacity: tuple[int, int, int] | None) -> str:
+    """Of the nets and their springs; where there is a capacity, of that alone."""
+    if capacity is not None:
+        return digest_of(np.array([[-1, -1], [len(nets), -1], capacity[:2], [capacity[2], -1]]))
+    return digest_of(np.concatenate([np.concatenate([p, [[net.n_nodes, -1]]]) for net, p in zip(nets, pairs, strict=True)]))
 
 
 def _check_room(degrees: list[np.ndarray], pairs: list[np.ndarray], n_nodes: int, n_springs: int, most: int) -> None:

@@ -93,7 +93,7 @@ class Fitted:
         return self._answers[spring]
 
     def coupling(self, one: int, others: list[int]) -> np.ndarray:
-        """b' A^-1 B: how a pull at `one` stretches the others [m/N]."""
+        """How far a pull at `one` stretches the others [m/N]."""
         tail, head = self._field.edges[np.asarray(others, int)].T
         answer = self.answer(one)
         return answer[head] - answer[tail]

@@ -59,6 +59,9 @@ def icosahedron(radius: Numbers = 1.0) -> tuple[np.ndarray, np.ndarray]:
     Args:
         radius: of the corners [m].
 
+    Returns:
+        `(points, triangles)`.
+
     Raises:
         ValueError: a radius that is not positive.
 

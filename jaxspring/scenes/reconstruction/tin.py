@@ -174,6 +174,9 @@ def fitted_tin(image: Image, points: Numbers, triangles: Numbers) -> Tin:
         points: (N, 2) or (N, 3) nodes in the unit of the image's spacing; x and y are read.
         triangles: (T, 3) node numbers.
 
+    Returns:
+        A `Tin`.
+
     Raises:
         ValueError: triangles that do not fit the points.
 

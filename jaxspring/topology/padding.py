@@ -145,11 +145,7 @@ def pad_nets(nets: Sequence[Graph], capacity: tuple[int, int, int] | None = None
     for b, degree in enumerate(degrees):
         if degree.max() > WIDEST:
             raise ValueError(f"nets[{b}] has a node with {degree.max()} springs; in a batch of nets a node has {WIDEST} at most.")
-    falling, n_springs = common(degrees), max(len(p) for p in pairs)
-    if capacity is not None:
-        n_nodes, n_springs, most = capacity
-        _check_room(degrees, pairs, n_nodes, n_springs, most)
-        falling = common([*degrees, np.full(n_nodes, most)])
+    falling, n_springs = _room(degrees, pairs, capacity)
     at = np.argsort(by_class(falling))
     made = [_placed_net(net, p, d, falling, at, n_springs) for net, p, d in zip(nets, pairs, degrees, strict=True)]
     every = [ends if ends.real is not None else dataclasses.replace(ends, real=jnp.ones(ends.entries.shape, bool)) for ends, *_ in made]
@@ -189,7 +185,11 @@ def _digest(nets: list[Any], pairs: list[np.ndarray], capacity: tuple[int, int, 
     return digest_of(np.concatenate([np.concatenate([p, [[net.n_nodes, -1]]]) for net, p in zip(nets, pairs, strict=True)]))
 
 
-def _check_room(degrees: list[np.ndarray], pairs: list[np.ndarray], n_nodes: int, n_springs: int, most: int) -> None:
+def _room(degrees: list[np.ndarray], pairs: list[np.ndarray], capacity: tuple[int, int, int] | None) -> tuple[np.ndarray, int]:
+    """Widths of the places of nodes, in falling order, and how many springs; ValueError where the capacity has no room for a net."""
+    if capacity is None:
+        return common(degrees), max(len(p) for p in pairs)
+    n_nodes, n_springs, most = capacity
     if not 0 < most <= WIDEST:
         raise ValueError(f"capacity gives a node room for {most} springs; expected 1 to {WIDEST}.")
     for b, (degree, edges) in enumerate(zip(degrees, pairs, strict=True)):
@@ -199,6 +199,7 @@ def _check_room(degrees: list[np.ndarray], pairs: list[np.ndarray], n_nodes: int
                 raise ValueError(f"nets[{b}] has {needed} {what}, but the capacity has room for {room}. Pass a larger one.")
         if not degree.all():
             raise ValueError(f"nets[{b}]: node {int(np.argmin(degree))} has no spring; with a capacity every node needs one.")
+    return common([*degrees, np.full(n_nodes, most)]), n_springs
 
 
 def _placed_net(

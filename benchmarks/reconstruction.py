@@ -5,8 +5,10 @@
 The main job with its default settings: one stiffness per spring, fitted through the rollout, on elevation models that ship with
 matplotlib and photographs that ship with scikit-image. First 41 x 41 nodes on every image; then 21, 41 and 81 nodes a side on two
 elevation models and three photographs, each mesh with as many nodes: `uniform`, the bilinear spline on the regular grid; `law`, the
-slides' stiffness law; `fitted`; `refined`, a fitted lattice of fewer nodes, split where its error is and its sides swapped; `delatin`,
-greedy insertion of the worst pixel into a Delaunay mesh (Garland and Heckbert 1995; the package pydelatin, of the extra `bench`).
+slides' stiffness law; `fitted`; `refined`, a fitted lattice of fewer nodes, split where its error is and its sides swapped; `triangles`,
+a coarse regular mesh split where its error is, then one stiffness per spring fitted on these triangles, and its sides swapped;
+`delatin`, greedy insertion of the worst pixel into a Delaunay mesh (Garland and Heckbert 1995; the package pydelatin, of the extra
+`bench`).
 
 Read: errors are root mean squares over all pixels in the image's own unit; `sampled` takes the height from the image under each node,
 `best` by least squares over all pixels; `greatest` is the largest error under the same rule; each ratio compares like rule with like.
@@ -85,7 +87,7 @@ def compared(name: str, image: js.Image, side: int, n_iterations: int) -> list[d
         angle = None if surface is None else _surface(surface).errors(image).least_angle
         folds = 0 if surface is None else surface.folds
         rows.append(_entry(kind, side**2, errors, greatest[kind], folds, angle, taken))
-    rows.append(refined(image, side, n_iterations))
+    rows += [refined(image, side, n_iterations), triangles(image, side, n_iterations)]
     rows += delatin(image, side**2)
     uniform = rows[0]
     for entry in rows:
@@ -103,6 +105,19 @@ def refined(image: js.Image, side: int, n_iterations: int) -> dict:
     finer = js.reconstruction.refine_by_error(image, start.points, start.triangles, side**2)
     tin = js.reconstruction.fitted_tin(image, finer.points, finer.mesh.triangles)
     return _of_tin("refined", image, js.reconstruction.swap_sides(image, tin), clock.seconds)
+
+
+def triangles(image: js.Image, side: int, n_iterations: int) -> dict:
+    """A regular mesh of half the nodes, split where its error is, its springs fitted, its sides swapped."""
+    clock = Stopwatch()
+    fewer = max(round(side * 0.5**0.5), 3)
+    ny, nx = image.shape
+    x, y = np.meshgrid(np.linspace(0, nx - 1, fewer), np.linspace(0, ny - 1, fewer))
+    points, corners = np.stack([x.ravel(), y.ravel()], axis=-1), triangle_corners(np.zeros((fewer - 1, fewer - 1), bool))
+    finer = js.reconstruction.refine_by_error(image, points, corners, side**2)
+    settings = js.reconstruction.PlanarSettings(n_iterations=n_iterations, learning_rate=0.05)
+    found = js.reconstruction.fit_triangles(image, finer.points, finer.mesh.triangles, settings)
+    return _of_tin("triangles", image, js.reconstruction.swap_sides(image, found.tin), clock.seconds)
 
 
 def delatin(image: js.Image, n_nodes: int) -> list[dict]:

@@ -155,3 +155,20 @@ def test_a_bound_that_cannot_be_held_is_named(fitted):
     assert not done.report()["max_error"]["holds"]
     assert "--max-error 1e-13 cannot be held" in done.complaint()
     assert "at pixel (" in done.complaint()
+
+
+def test_swapped_sides_follow_a_ridge(hill):
+    """The squared error falls, nodes stay, nothing folds; a diagonal across a ridge is turned along it."""
+    image, points, triangles = hill
+    before = js.reconstruction.fitted_tin(image, points, triangles)
+    after = js.reconstruction.swap_sides(image, before)
+    np.testing.assert_array_equal(after.points[:, :2], before.points[:, :2])
+    assert after.errors(image).rmse < before.errors(image).rmse
+    assert (after.errors(image).folds, after.errors(image).outside) == (0, 0)
+    assert len(after.triangles) == len(before.triangles)
+    y, x = np.mgrid[:20, :20]
+    ridge = js.Image(np.abs(1.0 * x - y))
+    across = js.reconstruction.Tin(np.array([[0.0, 0, 0], [19, 0, 0], [0, 19, 0], [19, 19, 0]]), np.array([[0, 1, 2], [2, 1, 3]]))
+    turned = js.reconstruction.swap_sides(ridge, across)
+    assert {tuple(sorted(t)) for t in turned.triangles.tolist()} == {(0, 1, 3), (0, 2, 3)}
+    assert turned.errors(ridge).rmse < 0.05

@@ -288,3 +288,20 @@ def test_faces_of_a_lattice_and_of_triangles():
     for net in (js.lattice((4, 5)), js.delaunay(np.array(list(itertools.product(range(4), range(5))), float) ** 1.01)):
         faces = Faces.of(net)
         assert ((faces.beside >= 0).sum(axis=1) == np.where(faces.ring, 1, 2)).all()
+
+
+def test_a_steep_slope_over_an_image_is_mended():
+    """Nodes alone would break it; the pixels are nearer to the surface in one piece, so it stays, and a fault breaks."""
+    x = np.mgrid[:60, :60][1]
+    places = np.stack(np.meshgrid(np.linspace(0, 59, 13), np.linspace(0, 59, 13)), axis=-1).reshape(-1, 2)
+    triangles = js.delaunay(places).triangles
+    slope = 0.1 * np.clip(x - 35, 0, 15)
+    found = js.reconstruction.break_surface(js.Image(slope), places, triangles, step=0.4)
+    assert found.breaks.steepest < 0.1 * 59 / 12
+    net = js.from_triangles(triangles, len(places))
+    assert find_breaks(net, places, np.asarray(js.Image(slope).sample(*places.T)), 1.0, 1.0, 0.4).n_broken > 10
+    assert found.breaks.n_broken == 0
+    both = js.reconstruction.break_surface(js.Image(slope + 1.0 * (x < 17)), places, triangles, step=0.4)
+    assert both.breaks.n_broken > 10
+    assert np.abs(np.concatenate(both.breaks.lines)[:, 0] - 16.5).max() < 5
+    assert both.rmse < both.unbroken.errors(js.Image(slope + 1.0 * (x < 17))).rmse

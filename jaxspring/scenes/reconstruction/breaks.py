@@ -148,23 +148,31 @@ def find_breaks(
     """
     field = HeightField.of(net, points, data, stiffness, data_stiffness)
     lowest = host_number("step", step, "Every spring would break.")
-    faces = Faces.of(net)
-    ends = field.edges
-    both = 0.5 * (field.data_stiffness[ends[:, 0]] + field.data_stiffness[ends[:, 1]])
-    chain = np.asarray(step_stiffness(field.stiffness, both), np.float64)
-    price = 0.5 * chain * lowest**2
+    faces, (chain, price) = Faces.of(net), _priced(field, lowest)
     allowed = ~faces.ring & (field.stiffness > 0)
-    broken = np.zeros(len(ends), bool)
+    broken = np.zeros(net.n_springs, bool)
     for factor in STAGES:
         broken = _stage(field, faces, chain, factor**2 * price, allowed, broken)
-    broken = _mended(field, price, allowed, broken)
+    return assembled(net, field, lowest, _mended(field, price, allowed, broken), image)
+
+
+def assembled(net: Topology, field: HeightField, step: float, broken: np.ndarray, image: Any) -> Breaks:
+    """The surface in balance with these springs (E,) broken, and what there is to say of it."""
+    chain, price = _priced(field, step)
     fit, before = Fitted(field, broken), Fitted(field, np.zeros_like(broken))
-    fraction = locate_breaks(image, field.points, ends, broken)
-    lines = trace(faces, field.points, ends, broken, fraction)
+    fraction = locate_breaks(image, field.points, field.edges, broken)
+    lines = trace(Faces.of(net), field.points, field.edges, broken, fraction)
     with np.errstate(divide="ignore", invalid="ignore"):
-        slope = np.where(field.stiffness > 0, lowest * chain / field.stiffness, np.inf)
+        slope = np.where(field.stiffness > 0, step * chain / field.stiffness, np.inf)
     gain = before.energy - fit.energy
     return Breaks(net, field.points, broken, fit.z, fraction, lines, gain, float(price[broken].sum()), float(slope.min()))
+
+
+def _priced(field: HeightField, step: float) -> tuple[np.ndarray, np.ndarray]:
+    """K of each spring in a chain of its like, and the price of breaking it."""
+    both = 0.5 * (field.data_stiffness[field.edges[:, 0]] + field.data_stiffness[field.edges[:, 1]])
+    chain = np.asarray(step_stiffness(field.stiffness, both), np.float64)
+    return chain, 0.5 * chain * step**2
 
 
 class _Line:

@@ -5,6 +5,7 @@
 
 Every pixel keeps a data spring; it acts on the nodes of its own side alone. Before the breaks are known, a node's datum is the image under
 it, since a mean over pixels on both sides of an edge is on neither; its data spring is as stiff as those of the pixels around it together.
+Lines along which the pixels are farther from the broken surface than from the whole one are mended.
 """
 
 from __future__ import annotations
@@ -17,7 +18,9 @@ from ..._arrays import Numbers
 from ..._checks import triangle_indices
 from ...images.image import Image
 from ...topology.builders import from_triangles
-from .breaks import Breaks, find_breaks
+from .break_energy import HeightField
+from .break_lines import Faces
+from .breaks import Breaks, assembled, find_breaks
 from .given import host_number, plane_points
 from .tin import Located, Tin, fitted_heights, locate_pixels, surface_matrix
 
@@ -80,13 +83,39 @@ def break_surface(image: Image, points: Numbers, triangles: Numbers, step: Numbe
     whole = Tin(np.column_stack([places, fitted_heights(matrix, truth, net)]), corners)
     number = np.asarray(matrix.sum(axis=0)).ravel()
     data = np.asarray(image.sample(places[:, 0], places[:, 1]), np.float64)
-    breaks = find_breaks(net, places, data, ratio * float(np.median(number[number > 0])), number, step, image)
-    sided = surface_matrix(sided_weights(located, corners, np.asarray(net.edges), breaks), corners, len(places))
-    z = fitted_heights(sided, truth, net, ~breaks.broken)
-    drawn = np.where(located.triangle < 0, np.nan, sided @ z)
+    k, lowest = ratio * float(np.median(number[number > 0])), host_number("step", step, "Every spring would break.")
+    breaks = find_breaks(net, places, data, k, number, lowest, image)
+    field = HeightField.of(net, places, data, k, number)
+
+    def fitted(broken: Breaks) -> tuple[np.ndarray, np.ndarray, float]:
+        sided = surface_matrix(sided_weights(located, corners, field.edges, broken), corners, len(places))
+        z = fitted_heights(sided, truth, net, ~broken.broken)
+        return z, sided @ z, float(np.sum((sided @ z - truth)[located.triangle >= 0] ** 2))
+
+    for line in _lines(breaks):
+        mended = assembled(net, field, lowest, breaks.broken & ~line, image)
+        # A slope that is steep but has no edge: the pixels are nearer to the surface in one piece.
+        breaks = mended if fitted(mended)[2] < fitted(breaks)[2] else breaks
+    z, surface, _ = fitted(breaks)
+    drawn = np.where(located.triangle < 0, np.nan, surface)
     error = np.abs(drawn - truth)
     rmse, greatest = float(np.sqrt(np.nanmean(error**2))), float(np.nanmax(error))
     return BrokenSurface(Tin(np.column_stack([places, z]), corners), breaks, drawn.reshape(image.shape), whole, rmse, greatest)
+
+
+def _lines(breaks: Breaks) -> list[np.ndarray]:
+    """(E,) booleans for each group of broken springs that hang together by faces, the smallest group first."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    beside, springs = Faces.of(breaks.net).beside, np.flatnonzero(breaks.broken)
+    n_faces, n = int(beside.max(initial=-1)) + 1, len(springs)
+    rows, faces = np.repeat(np.arange(n), 2), beside[springs].ravel()
+    rows, faces = rows[faces >= 0], faces[faces >= 0]
+    joined = coo_array((np.ones(len(rows)), (rows, n + faces)), shape=(n + n_faces, n + n_faces))
+    _, group = connected_components(joined, directed=False)
+    groups = [springs[group[:n] == g] for g in np.unique(group[:n])]
+    return [np.isin(np.arange(len(breaks.broken)), some) for some in sorted(groups, key=len)]
 
 
 def sided_weights(located: Located, triangles: np.ndarray, edges: np.ndarray, breaks: Breaks) -> Located:

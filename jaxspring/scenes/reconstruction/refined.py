@@ -65,6 +65,12 @@ def refine_by_error(
 
     Raises:
         ValueError: fewer nodes than there are, triangles that do not fit, an observation of another shape.
+
+    >>> y, x = np.mgrid[:40, :40]
+    >>> edge = Image(np.tanh(0.5 * (x - 12.0)))
+    >>> found = refine_by_error(edge, [(0, 0), (39, 0), (0, 39), (39, 39)], [(0, 1, 2), (2, 1, 3)], n_nodes=60, rounds=5)
+    >>> bool(found.mesh.n_nodes <= 60 and np.median(found.points[:, 0]) < 19.5)
+    True
     """
     places = plane_points(points)
     corners = triangle_indices("triangles", triangles, len(places))

@@ -80,6 +80,8 @@ def number(value: float) -> np.ndarray:
     return np.asarray(value)
 
 
+OVER = np.array([[0.0, 0.0], [5.0, 0.0], [0.0, 4.0], [5.0, 4.0]])  # corners of the image
+
 DOORS: dict[str, Door] = {
     "AngularJoints": Door(
         lambda **a: js.cloth.AngularJoints(js.lattice(N), **a),
@@ -342,6 +344,57 @@ DOORS: dict[str, Door] = {
         {"points": SQUARE, "groups": np.array([0, 1, -1, 0, 1])},
         on_host=("groups",),
     ),
+    "SlidingBorder": Door(
+        lambda **a: js.reconstruction.SlidingBorder(sheet(), **a), {"points": SQUARE, "corner": number(2.0)}, on_host=("points", "corner")
+    ),
+    "Tin": Door(
+        lambda **a: jnp.asarray(js.reconstruction.Tin(**a).points),
+        {"points": CORNER, "triangles": TETRAHEDRON},
+        on_host=("points", "triangles"),
+    ),
+    "active_contour": Door(
+        lambda **a: js.reconstruction.active_contour(image(), sigma=1.0, radius=4, **a),
+        {"points": OVER, "tension": per_node(), "bending": per_node(), "strength": number(2.0)},
+        on_host=("points",),
+    ),
+    "bound_error": Door(
+        lambda **a: jnp.asarray(js.reconstruction.bound_error(image(), **a).tin.points),
+        {"points": OVER, "triangles": TRIANGLES, "bound": number(0.5)},
+        on_host=("points", "triangles", "bound"),
+    ),
+    "break_surface": Door(
+        lambda **a: jnp.asarray(js.reconstruction.break_surface(image(), **a).drawn),
+        {"points": OVER, "triangles": TRIANGLES, "step": number(40.0), "smoothing": number(2.0)},
+        on_host=("points", "triangles", "step", "smoothing"),
+    ),
+    "find_breaks": Door(
+        lambda **a: jnp.asarray(js.reconstruction.find_breaks(net(), **a).heights),
+        {
+            "points": np.arange(4.0)[:, None],
+            "data": per_node(),
+            "stiffness": per_spring(),
+            "data_stiffness": per_node(),
+            "step": number(9.0),
+        },
+        on_host=("points", "data", "stiffness", "data_stiffness", "step"),
+    ),
+    "fit_shell": Door(
+        lambda **a: jnp.asarray(js.reconstruction.fit_shell(n_levels=0, **a).points),
+        {"data": CORNER + 0.125, "points": CORNER, "triangles": TETRAHEDRON, "stiffness": number(0.5)},
+        on_host=("data", "points", "triangles", "stiffness"),
+    ),
+    "fitted_tin": Door(
+        lambda **a: jnp.asarray(js.reconstruction.fitted_tin(image(), **a).points),
+        {"points": OVER, "triangles": TRIANGLES},
+        on_host=("points", "triangles"),
+    ),
+    "icosahedron": Door(lambda radius: jnp.asarray(js.reconstruction.icosahedron(radius)[0]), {"radius": number(2.0)}, on_host=("radius",)),
+    "refine_by_error": Door(
+        lambda **a: jnp.asarray(js.reconstruction.refine_by_error(image(), n_nodes=9, **a).stiffness),
+        {"points": OVER, "triangles": TRIANGLES, "stiffness": np.arange(1.0, 6.0)},
+        on_host=("points", "triangles", "stiffness"),
+    ),
+    "step_stiffness": Door(js.reconstruction.step_stiffness, {"stiffness": per_spring(), "data_stiffness": per_spring(0.25)}),
     "squared_distance": Door(lambda target: js.squared_distance(jnp.zeros((N, 2)), target), {"target": np.arange(8.0).reshape(N, 2)}),
 }
 
@@ -349,6 +402,7 @@ DOORS: dict[str, Door] = {
 BY_HAND = {
     "diffeqsolve",
     "fit",
+    "fit_triangles",
     "check_gradient",
     "frequency_response",
     "from_networkx",
@@ -358,16 +412,18 @@ BY_HAND = {
     "save_obj",
     "save_ply",
     "save_stl",
+    "save_tin",
     "save_vtk",
     "save_xyz",
 }
 
 # What the library makes and hands out; nobody else builds it.
 MADE_INSIDE = """
-    Account Blocks Body BoundSystem CellDyads Cloth ClothScene Creased Energy Equilibrium Finding Fit GradientCheck
-    Ground History Impulse Iteration Map Memory MeshReport Modes Moduli NetBatch NodeDyads OdeInfo OdeResult Onset Overlay
-    PointSurface Profile Reconstructed Result Resume Scene Selection SkylineFactor SolveInfo Solves SpringBlocks SpringMatrix
-    Status Step Surface Torn Undetermined Yielded
+    Account Blocks Body BoundedSurface BoundSystem Breaks BrokenSurface CellDyads Cloth ClothScene Creased Energy
+    Equilibrium Finding Fit GradientCheck Ground History Impulse Iteration Map Memory MeshReport Modes Moduli
+    NetBatch NodeDyads OdeInfo OdeResult Onset Overlay PlanarFit PointSurface Profile Reconstructed Refined Result
+    Resume Scene Selection Shell SkylineFactor SolveInfo Solves SpringBlocks SpringMatrix Status Step Subdivision
+    Surface SurfaceErrors Torn Undetermined Yielded
 """
 
 # Objects made of options, other objects, functions or files: no array of the user's enters.
@@ -378,7 +434,7 @@ NO_ARRAYS = """
     GradientMagnitude GradientWarning GroundSettings HalfCells HeatIteration HeatScheme HeightField Holes Hooke Identity ImageError
     ImplicitMidpoint Impulses Intensity Jacobi JaxCG LBFGS Lattice Law LeastSquares Ledger LinearSolver
     Linearisation Lineax Luminance Molten Moving Multigrid Natural NeuralController Newton NoCutoff Observation
-    Obstacle Optax Optimiser Ordering PairLaw Pairs PointSettings Positive PowerLaw Preconditioner Progress Published PullLaw
+    Obstacle Optax Optimiser Ordering PairLaw Pairs PlanarSettings PointSettings Positive PowerLaw Preconditioner Progress Published PullLaw
     Reconstruction Relaxation ReverseCuthillMcKee Robot RobotSettings Rule RungeKutta4 Sampling Secant SemiImplicit
     SignedDistance SimulationError Skyline SoftPositive SplitHeat SpringSettings StabilityWarning Stepper
     StiffnessRule Still Stop StopReason StoreAll StoreStates SymmetricSplitHeat SymplecticEuler Tangent TensionOnly
@@ -386,7 +442,7 @@ NO_ARRAYS = """
     disc distance domain drape_coefficient elevation_model energy_ledger equilibrium fit_constants fit_points fit_springs flag
     from_mesh gradient_magnitude hanging impulses load load_image load_map load_points melted_fraction normal_modes on_ball on_table
     pad_nets principal_curvatures push_out raise_for_status rectangle save save_trajectory select smoothing_radius
-    stable_dt total_heat train walk
+    stable_dt swap_sides total_heat train walk
 """
 
 

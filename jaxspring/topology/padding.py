@@ -106,17 +106,22 @@ class NetBatch(eqx.Module):
         return arrays
 
 
-def pad_nets(nets: Sequence[Graph]) -> NetBatch:
+def pad_nets(nets: Sequence[Graph], capacity: tuple[int, int, int] | None = None) -> NetBatch:
     """Different graphs as one batch, for `jax.vmap` and `js.batch`: one compile, one program.
 
+    With a capacity, batches made one after the other share that program as well, such as a mesh that is refined while it runs. Such nets
+    are told apart by their capacity alone: broken springs of one mean nothing to another.
+
     Args:
-        nets: two or more graphs, with or without periods alike. What a batch costs is what its largest net costs, for each of them.
+        nets: one or more graphs, with or without periods alike. What a batch costs is what its largest net costs, for each of them.
+        capacity: room for so many nodes, springs, and springs at a node; None: what these nets need.
 
     Returns:
         A `NetBatch`: the stacked net, and what brings arrays of the nets to its places and back.
 
     Raises:
-        ValueError: no net, a net without springs, one with more than 64 springs at a node, periods in some nets only.
+        ValueError: no net, a net without springs, one with more than 64 springs at a node, periods in some nets only; more than there
+            is room for, or a node without a spring where a capacity is given.
         TypeError: a net that is no `Graph`.
 
     >>> import jax
@@ -140,9 +145,8 @@ def pad_nets(nets: Sequence[Graph]) -> NetBatch:
     for b, degree in enumerate(degrees):
         if degree.max() > WIDEST:
             raise ValueError(f"nets[{b}] has a node with {degree.max()} springs; in a batch of nets a node has {WIDEST} at most.")
-    falling = common(degrees)
+    falling, n_springs = _room(degrees, pairs, capacity)
     at = np.argsort(by_class(falling))
-    n_springs = max(len(p) for p in pairs)
     made = [_placed_net(net, p, d, falling, at, n_springs) for net, p, d in zip(nets, pairs, degrees, strict=True)]
     every = [ends if ends.real is not None else dataclasses.replace(ends, real=jnp.ones(ends.entries.shape, bool)) for ends, *_ in made]
     ends = jax.tree.map(lambda *leaves: jnp.stack(leaves), *every)
@@ -153,7 +157,7 @@ def pad_nets(nets: Sequence[Graph]) -> NetBatch:
         count=len(falling),
         nodes=Permutation(np.arange(len(falling))),
         springs=Permutation(np.arange(n_springs)),
-        digest=digest_of(np.concatenate([np.concatenate([p, [[net.n_nodes, -1]]]) for net, p in zip(nets, pairs, strict=True)])),
+        digest=_digest(nets, pairs, capacity),
         name=None,
     )
     nodes, springs = tuple(p for _, p, _, _ in made), tuple(s for *_, s, _ in made)
@@ -172,6 +176,30 @@ def _check(nets: list[Any]) -> None:
             raise ValueError(f"nets[{b}] has no spring.")
         if (net.box is None) != (nets[0].box is None) or (net.box is not None and net.box.shape != nets[0].box.shape):
             raise ValueError(f"nets[{b}] and nets[0] have not the same periodic coordinates; all nets of a batch have, or none.")
+
+
+def _digest(nets: list[Any], pairs: list[np.ndarray], capacity: tuple[int, int, int] | None) -> str:
+    """Of the nets and their springs; where there is a capacity, of that alone."""
+    if capacity is not None:
+        return digest_of(np.array([[-1, -1], [len(nets), -1], capacity[:2], [capacity[2], -1]]))
+    return digest_of(np.concatenate([np.concatenate([p, [[net.n_nodes, -1]]]) for net, p in zip(nets, pairs, strict=True)]))
+
+
+def _room(degrees: list[np.ndarray], pairs: list[np.ndarray], capacity: tuple[int, int, int] | None) -> tuple[np.ndarray, int]:
+    """Widths of the places of nodes, in falling order, and how many springs; ValueError where the capacity has no room for a net."""
+    if capacity is None:
+        return common(degrees), max(len(p) for p in pairs)
+    n_nodes, n_springs, most = capacity
+    if not 0 < most <= WIDEST:
+        raise ValueError(f"capacity gives a node room for {most} springs; expected 1 to {WIDEST}.")
+    for b, (degree, edges) in enumerate(zip(degrees, pairs, strict=True)):
+        needs = (("nodes", len(degree), n_nodes), ("springs", len(edges), n_springs), ("springs at a node", int(degree.max()), most))
+        for what, needed, room in needs:
+            if needed > room:
+                raise ValueError(f"nets[{b}] has {needed} {what}, but the capacity has room for {room}. Pass a larger one.")
+        if not degree.all():
+            raise ValueError(f"nets[{b}]: node {int(np.argmin(degree))} has no spring; with a capacity every node needs one.")
+    return common([*degrees, np.full(n_nodes, most)]), n_springs
 
 
 def _placed_net(

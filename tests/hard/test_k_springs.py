@@ -568,6 +568,7 @@ def instances():
             pixels,
         ),
         js.reconstruction.Reconstructed(*[None] * len(dataclasses.fields(js.reconstruction.Reconstructed))),
+        *surfaces(image),
         *(
             js.thermal.Convection(TWO, nodes, 1.0, ambient, 1.0),
             js.thermal.FixedTemperature(TWO, nodes, 300.0),
@@ -663,6 +664,20 @@ def instances():
         *(js.robot.Oscillators([0.1], [0.0], 1.0), js.robot.Actuation(js.robot.Oscillators([0.1], [0.0], 1.0), [0])),
     ]
     return {type(a).__name__: a for a in classes}
+
+
+def surfaces(image):
+    """Meshes over an image, of every class."""
+    rec, points = js.reconstruction, np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    tin = rec.fitted_tin(image, points, [(0, 1, 2)])
+    breaks = rec.find_breaks(TWO, [[0.0], [1.0]], [0.0, 5.0], 1.0, 0.1, 1.0)
+    mesh, net = rec.Subdivision.of([(0, 1, 2)], 3), js.from_triangles([(0, 1, 2)], 3)
+    return (
+        *(tin, tin.errors(image), breaks, rec.BrokenSurface(tin, breaks, points, tin, 1.0, 1.0)),
+        *(mesh, rec.Refined(mesh, mesh, points, np.ones(3)), rec.BoundedSurface(tin, 1.0, 1.0, True, 0, (0, 0))),
+        *(rec.SlidingBorder(net, points), rec.PlanarSettings(), rec.PlanarFit(tin, np.ones(3), None, js.Status.ok())),
+        rec.Shell(*rec.icosahedron(), (1.0,), (12,), ()),
+    )
 
 
 INSTANCES = instances()

@@ -63,6 +63,9 @@ def complaint(arguments, capsys):
         (["fit", "--parameters", "stifness"], "stifness is not among stiffness"),
         (["fit", "--parameters", ""], "is not among"),
         (["fit", "--fill", "nan"], "'nan' is not a finite number"),
+        (["fit", "--break", "0"], "'0' is not above zero"),
+        (["fit", "--max-error", "-1"], "expected one argument|is not above zero"),
+        (["fit", "--export", "obj,stl"], "stl is not among obj, ply, geojson"),
         (["fit", "--page", "-1"], "expected one argument|is not a whole number"),
         (["fit", "--iteration", "3"], "unrecognized arguments: --iteration"),
         (["fit", "a.png", "b.png"], "unrecognized arguments: b.png"),
@@ -273,6 +276,7 @@ def check_report(report):
     assert report["settings"] == {"nodes": [5, 6], "parameters": ["stiffness"], "iterations": 4}
     assert len(report["loss"]) == 5
     assert report["versions"]["jax"]
+    assert all(report["greatest_error"][name][rule] > errors[rule] for name, errors in rmse.items() for rule in errors)
     assert set(report["seconds"]) == {"compile", "run", "other", "total"}
     assert report["parameters"]["before"] != report["parameters"]["after"]
 

@@ -15,6 +15,7 @@ LAW = ("k_min", "k_max", "sigma", "k_data", "drag")
 # As SpringSettings and ConstantsSettings have them; a test compares. Repeated so that `--help` loads no JAX.
 UPDATES_OF_STIFFNESS, UPDATES_OF_CONSTANTS = 700, 100
 PARAMETERS = ("stiffness", "k_pixel", *LAW)
+ENDINGS = ("obj", "ply", "geojson")
 LARGEST_MESH = 4_000_000  # nodes: beyond, one rollout alone takes minutes
 
 
@@ -47,6 +48,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--page", type=whole_number, metavar="N", help="page of a TIFF, or frame of an animated PNG, from 0")
     parser.add_argument(
+        "--break", dest="step", type=above_zero, metavar="STEP", help="break the surface along steps higher than this, in the image's unit"
+    )
+    parser.add_argument("--max-error", type=above_zero, metavar="E", help="split triangles until no pixel is off by more than this")
+    parser.add_argument(
+        "--export", type=endings, default=(), metavar="LIST", help=f"write the surface as a TIN: some of {','.join(ENDINGS)}"
+    )
+    parser.add_argument(
         "--resume", action="store_true", help="go on from the checkpoint of an interrupted or finished run with the same DIR"
     )
 
@@ -64,13 +72,15 @@ def run(given: argparse.Namespace, out: pathlib.Path) -> Written:
         UnusableError: the image cannot be used.
     """
     from ...images.files import ImageError
+    from .extras import Extras
     from .job import Job
 
     name = "elevation model of matplotlib" if given.image is None else str(pathlib.Path(given.image))
     usual = UPDATES_OF_STIFFNESS if given.parameters == ("stiffness",) else UPDATES_OF_CONSTANTS
     updates = usual if given.iterations is None else given.iterations
     try:
-        return Job(load(given), name, given.nodes, given.parameters, updates, out).run(given.resume)
+        extras = Extras(given.step, given.max_error, given.export)
+        return Job(load(given), name, given.nodes, given.parameters, updates, out, extras).run(given.resume)
     except ImageError as error:
         raise UnusableError(str(error)) from error
 
@@ -114,6 +124,23 @@ def parameters(text: str) -> tuple[str, ...]:
     if len(names) > 1 and not set(names) <= set(LAW):
         raise argparse.ArgumentTypeError(f"{text!r}: stiffness and k_pixel are fitted alone; only {', '.join(LAW)} go together")
     return names
+
+
+def above_zero(text: str) -> float:
+    """An argument that is a number above zero."""
+    value = number(text)
+    if value <= 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is not above zero")
+    return value
+
+
+def endings(text: str) -> tuple[str, ...]:
+    """`obj,ply` as ("obj", "ply")."""
+    names = tuple(part.strip().lower() for part in text.split(","))
+    unknown = [name for name in names if name not in ENDINGS]
+    if unknown:
+        raise argparse.ArgumentTypeError(f"{', '.join(unknown) or 'nothing'} is not among {', '.join(ENDINGS)}")
+    return tuple(dict.fromkeys(names))
 
 
 COMMAND = Command(

@@ -24,8 +24,9 @@ from ..command import FailedError, StoppedError, Written
 from ..drawing import canvas_and_figure
 from ..folder import ResultFolder, versions
 from .constants import Constants, ConstantsSettings, fit_constants
+from .extras import Extras, fitted_surface, greatest_errors
 from .fitting import Reconstructed, SpringSettings, fit_springs
-from .pictures import draw_pictures, triangle_corners
+from .pictures import draw_pictures
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,7 @@ class Job:
         parameters: what is fitted.
         n_iterations: updates of the parameters.
         out: the folder for the results.
+        extras: what is done with the fitted mesh besides.
     """
 
     image: Image
@@ -47,6 +49,7 @@ class Job:
     parameters: tuple[str, ...]
     n_iterations: int
     out: pathlib.Path
+    extras: Extras = Extras()  # noqa: RUF009 (frozen, holds no array)
 
     def run(self, resume: bool) -> Written:
         """Fit and write.
@@ -74,11 +77,16 @@ class Job:
         status = found.fit.status.then(found.status)
         if not bool(status.is_ok):
             raise FailedError(f"the fit failed after {done} iterations: {status.describe()}.")
-        report = self._report(found, bar, clock.seconds)
+        finished = self.extras.make(self.image, found)
+        report = {**self._report(found, bar, clock.seconds), **finished.report()}
         with place.filling(report, keep_checkpoint=True, lost="fitting anew") as folder:
             write_archive(folder / "mesh.npz", mesh_arrays(found), {"kind": "mesh"})
             pictures = draw_pictures(folder, self.image, found)
-        return Written(table(report), f"report.json, mesh.npz and {len(pictures)} pictures")
+            finished.write(folder, self.image)
+        complaint = finished.complaint()
+        if complaint is not None:
+            raise FailedError(complaint)
+        return Written(table(report) + finished.table(), f"report.json, mesh.npz and {len(pictures)} pictures")
 
     def _fit(self, bar: _Bar, place: Checkpoint, resume: bool) -> Reconstructed:
         if self.parameters == ("stiffness",):
@@ -121,6 +129,7 @@ class Job:
                 name: {"sampled": errors.sampled, "best": errors.best}
                 for name, errors in (("uniform", found.uniform), ("law", found.law.rmse), ("fitted", found.fitted.rmse))
             },
+            "greatest_error": greatest_errors(self.image, found),
             "folds": found.fitted.folds,
             "folds_at_worst": max(bar.folds, found.fitted.folds),
             "outside": found.fitted.outside,
@@ -157,14 +166,13 @@ def mesh_arrays(found: Reconstructed) -> dict[str, np.ndarray]:
 
     x and y are in the unit of the image's spacing (pixels for the command), z in that of its values.
     """
-    mesh, net = found.fitted, found.scene.net
-    points = np.stack([np.ravel(a) for a in (mesh.x, mesh.y, mesh.z_best)], axis=-1).astype(np.float64)
-    unreached = {} if mesh.unreached is None else {"unreached": np.ravel(mesh.unreached)}
+    surface = fitted_surface(found)
+    unreached = {} if found.fitted.unreached is None else {"unreached": np.ravel(found.fitted.unreached)}
     return {
-        "points": points,
-        "z_sampled": np.ravel(mesh.z_sampled),
-        "triangles": triangle_corners(mesh.flip),
-        "edges": np.asarray(net.edges),
+        "points": surface.points,
+        "z_sampled": np.ravel(found.fitted.z_sampled),
+        "triangles": surface.triangles,
+        "edges": np.asarray(found.scene.net.edges),
         "stiffness": np.asarray(found.stiffness),
         **unreached,
     }

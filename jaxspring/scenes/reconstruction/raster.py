@@ -93,11 +93,25 @@ def locate(x: Node, y: Node, flip: Flip, grid: PixelGrid, triangle: Int[Array, "
     """Triangles that hold the pixels, walking from those in `triangle`. Not differentiated: where a derivative exists, it is constant."""
     x, y = lax.stop_gradient((x, y))
     vertices = [c.reshape(-1) for a in (x, y) for c in corners(a, flip)]
-    n_triangles = 2 * flip.size
-    across = neighbours(flip).reshape(-1)
-    image_area = (x[-1, -1] - x[0, 0]) * (y[-1, -1] - y[0, 0])
-    tolerance = -EDGE_ROUNDING * jnp.finfo(x.dtype).eps * image_area / math.sqrt(flip.size)
-    most = WALKS * sum(x.shape)
+    area = (x[-1, -1] - x[0, 0]) * (y[-1, -1] - y[0, 0])
+    return walk(vertices, neighbours(flip).reshape(-1), grid, triangle, area / math.sqrt(flip.size), WALKS * sum(x.shape))
+
+
+def walk(
+    vertices: list[Array], across: Int[Array, " T3"], grid: PixelGrid, triangle: Int[Array, " P"], area: Array, most: int
+) -> Location:
+    """The walk through any triangles.
+
+    Args:
+        vertices: x of the corners a, b and c of each triangle, (T,) each, then y.
+        across: (3 T,) the triangle across the side opposite to a, of all triangles, then to b, then to c.
+        grid: the pixels.
+        triangle: where each walk starts.
+        area: of the whole mesh, over the square root of its number of cells: what areas are rounded by.
+        most: steps at most.
+    """
+    n_triangles = vertices[0].shape[0]
+    tolerance = -EDGE_ROUNDING * jnp.finfo(vertices[0].dtype).eps * area
 
     def step(walk: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
         triangle, _, _, n = walk

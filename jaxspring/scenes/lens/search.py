@@ -3,10 +3,10 @@
 Cells are cut by turns along one diagonal and the other (`turned`), which keeps the mesh as stiff along either. Inside a triangle both maps
 are affine and exact inverses of each other,
 
-    (x, y) = c + F (u, v)          (u, v) = c' + F^-1 (x, y)          [pixels]
+    (x, y) = (x, y)_a + F [(u, v) - (u, v)_a]          (u, v) = (u, v)_a + F^-1 [(x, y) - (x, y)_a]          [pixels]
 
-with (u, v) on the image and (x, y) where it is shown. Each triangle's six numbers stand in one row of a table: a point reads a single row,
-and the derivative adds up rows.
+with (u, v) on the image, (x, y) where it is shown, and a one of its corners, which keeps the rounding that of a cell and not of the image.
+Each triangle's eight numbers stand in one row of a table: a point reads a single row, and the derivative adds up rows.
 
 The search jumps to where the current triangle's map would put the point, and after a few jumps walks: it crosses the edge that the point is
 farthest beyond. Points are looked at together and the number of steps is bounded; which triangle holds a point has no derivative.
@@ -26,7 +26,7 @@ from ..reconstruction.triangles import Node, corners
 
 JUMPS = 6
 # A walk crosses the mesh in about as many steps as it has cells along both sides.
-WALKS = 3
+WALKS = 1
 # Within so much of a cell of an edge either triangle will do: the maps are continuous.
 ON_EDGE = 1e-4
 
@@ -38,13 +38,13 @@ def turned(cells: tuple[int, int]) -> Bool[np.ndarray, "my mx"]:
 
 
 class Affine(NamedTuple):
-    """A map that is affine on each triangle, (a + b x + c y, d + e x + f y).
+    """A map that is affine on each triangle: (u + b (x - a) + c (y - d), v + e (x - a) + f (y - d)).
 
     Attributes:
-        rows: (T, 6) the six numbers of each triangle.
+        rows: (T, 8) the numbers a, d, u, v, b, c, e, f of each triangle.
     """
 
-    rows: Float[Array, "T 6"]
+    rows: Float[Array, "T 8"]
 
     @staticmethod
     def between(x: Node, y: Node, u: Node, v: Node) -> Affine:
@@ -55,13 +55,15 @@ class Affine(NamedTuple):
         area = px * qy - py * qx
         ux, uy = ((bu - au) * qy - (cu - au) * py) / area, ((cu - au) * px - (bu - au) * qx) / area
         vx, vy = ((bv - av) * qy - (cv - av) * py) / area, ((cv - av) * px - (bv - av) * qx) / area
-        six = (au - ux * ax - uy * ay, ux, uy, av - vx * ax - vy * ay, vx, vy)
-        return Affine(jnp.stack([a.reshape(-1) for a in six], axis=-1))
+        eight = (ax, ay, au, av, ux, uy, vx, vy)
+        # Behind a barrier: XLA would else make the table anew for every point that reads it.
+        return Affine(lax.optimization_barrier(jnp.stack([a.reshape(-1) for a in eight], axis=-1)))
 
     def __call__(self, x: Array, y: Array, triangle: Int[Array, " P"]) -> tuple[Array, Array]:
         """Where the points (x, y) (P,) go, by the maps of these triangles."""
-        a, b, c, d, e, f = jnp.unstack(read(self.rows, triangle), axis=-1)
-        return a + b * x + c * y, d + e * x + f * y
+        a, d, u, v, b, c, e, f = jnp.unstack(read(self.rows, triangle), axis=-1)
+        x, y = x - a, y - d
+        return u + (b * x + c * y), v + (e * x + f * y)
 
 
 def triangle_at(s: Array, t: Array, cells: tuple[int, int]) -> Int[Array, " P"]:
@@ -91,19 +93,25 @@ def search(
     inverse, x, y = lax.stop_gradient((inverse, x, y))
     most = JUMPS + WALKS * sum(cells)
 
-    def step(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        triangle, n, _ = state
+    def goes_on(state: tuple[Array, Array, Array, Array]) -> Array:
+        return ~jnp.all(state[2]) & (state[3] < most)
+
+    def step(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+        # Whether a point is inside is decided in one pass and acted on in the next: computed twice within one, for the choice and for
+        # the count, it could be yes and no by rounding, and such a point would never move nor be found.
+        last, following, is_inside, n = state
+        triangle = jnp.where(is_inside, last, following)
         u, v = inverse(x, y, triangle)
         s, t = u / size[0], v / size[1]
         following, is_inside = _across(triangle, s, t, cells)
-        jumped = triangle_at(s, t, cells)
-        following = jnp.where(n < JUMPS, jumped, following)
-        return jnp.where(is_inside, triangle, following), n + 1, jnp.sum(~is_inside, dtype=jnp.int32)
+        # Who would walk back to where it came from stands on the edge between, as far as rounding can tell.
+        is_inside |= (n > JUMPS) & (following == last)
+        return triangle, jnp.where(n < JUMPS, triangle_at(s, t, cells), following), is_inside, n + 1
 
     start = triangle_at(x / size[0], y / size[1], cells) if start is None else start
-    count = jnp.asarray(start.size, jnp.int32)
-    triangle, n, n_lost = lax.while_loop(lambda s: (s[2] > 0) & (s[1] < most), step, (start, jnp.zeros((), jnp.int32), count))
-    return Found(triangle, n, n_lost)
+    first = (start, start, jnp.zeros(start.shape, bool), jnp.zeros((), jnp.int32))
+    triangle, _, is_inside, n = lax.while_loop(goes_on, step, first)
+    return Found(triangle, n, jnp.sum(~is_inside, dtype=jnp.int32))
 
 
 def _across(triangle: Array, s: Array, t: Array, cells: tuple[int, int]) -> tuple[Array, Array]:

@@ -133,7 +133,7 @@ class Warp(eqx.Module):
     def anisotropy(self) -> Float[Array, "2 my mx"]:
         """The larger stretch over the smaller in every triangle: 1 where shapes are kept."""
         rows = Affine.between(self.mesh.x, self.mesh.y, self.position.x, self.position.y).rows
-        a, b, c, d = rows[:, 1], rows[:, 2], rows[:, 4], rows[:, 5]
+        a, b, c, d = (rows[:, i] for i in range(4, 8))
         # Singular values of a 2 x 2 matrix: half the sum and difference of the moduli of its two complex parts.
         turn = jnp.sqrt((a + d) ** 2 + (c - b) ** 2)
         shear = jnp.sqrt((a - d) ** 2 + (b + c) ** 2)

@@ -218,11 +218,15 @@ def ramped(foci: Focus | Sequence[Focus], part: Array | float) -> tuple[Focus, .
         foci: one or several.
         part: from 0 to 1; a number, which may be traced.
 
+    Raises:
+        ValueError: a part that is negative.
+
     >>> print(ramped(Disc((10.0, 10.0), 5.0, magnification=4.0), 0.5)[0].magnification)
     2.0
     """
     several = (foci,) if isinstance(foci, Focus) else tuple(foci)
-    return tuple(eqx.tree_at(lambda f: f.magnification, focus, focus.magnification**part) for focus in several)
+    power = constant("part", part, "A ramp begins at nothing.", may_be_zero=True)
+    return tuple(eqx.tree_at(lambda f: f.magnification, f, f.magnification ** power.astype(f.magnification.dtype)) for f in several)
 
 
 def _hats(nodes: Array, n: int, spacing: Array, origin: Array) -> Array:

@@ -180,7 +180,7 @@ def _nodes(shape: tuple[int, int], nodes: int | tuple[int, int]) -> tuple[int, i
         ny, nx = (max(round((nodes - 1) * (n - 1) / longest), 4) + 1 for n in shape)
     else:
         ny, nx = nodes
-    if min(ny, nx) < 5 or ny > shape[0] or nx > shape[1]:
+    if (isinstance(nodes, int) and nodes < 5) or min(ny, nx) < 5 or ny > shape[0] or nx > shape[1]:
         raise ValueError(
             f"nodes = {nodes} makes {ny} x {nx} nodes on {shape[0]} x {shape[1]} pixels; expected 5 or more, and no more than pixels."
         )

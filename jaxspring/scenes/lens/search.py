@@ -27,8 +27,8 @@ from ..reconstruction.triangles import Node, corners
 JUMPS = 6
 # A walk crosses the mesh in about as many steps as it has cells along both sides.
 WALKS = 1
-# Within so much of a cell of an edge either triangle will do: the maps are continuous.
-ON_EDGE = 1e-4
+# Rounding of a place, in epsilons of the cells along a side: within it of an edge either triangle will do, the maps being continuous.
+EDGE_ROUNDING = 4.0
 
 
 def turned(cells: tuple[int, int]) -> Bool[np.ndarray, "my mx"]:
@@ -137,7 +137,7 @@ def _across(triangle: Array, s: Array, t: Array, cells: tuple[int, int]) -> tupl
     above = cell + jnp.where(is_lower, cells[1], n_cells - cells[1])
     partner = cell + jnp.where(is_lower, 0, n_cells)
     following = jnp.where(least == along_row, above, jnp.where(least == along_column, beside, partner))
-    return following.astype(jnp.int32), least >= -ON_EDGE
+    return following.astype(jnp.int32), least >= -EDGE_ROUNDING * float(jnp.finfo(s.dtype).eps) * max(cells)
 
 
 def _whole(s: Array, n: int) -> Int[Array, " P"]:

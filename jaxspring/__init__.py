@@ -18,6 +18,7 @@ if TYPE_CHECKING:  # written by `python -m tests.face`
     from . import fluid as fluid
     from . import images as images
     from . import inverse as inverse
+    from . import lens as lens
     from . import linalg as linalg
     from . import plasticity as plasticity
     from . import reconstruction as reconstruction
@@ -50,7 +51,6 @@ if TYPE_CHECKING:  # written by `python -m tests.face`
     from .blocks import Checkpointed as Checkpointed
     from .blocks import StoreAll as StoreAll
     from .blocks import StoreStates as StoreStates
-    from .watch import Solves as Solves
     from .progress import Progress as Progress
     from .files import load as load
     from .files import save as save

@@ -23,7 +23,6 @@ PUBLIC: dict[str, dict[str, tuple[str, ...]]] = {
         "sharing": ("domain",),
         "ode": ("OdeInfo", "OdeResult", "diffeqsolve"),
         "blocks": ("Checkpointed", "StoreAll", "StoreStates"),
-        "watch": ("Solves",),
         "progress": ("Progress",),
         "files": ("load", "save", "save_trajectory"),
         "archive": ("CheckpointError",),
@@ -147,6 +146,12 @@ PUBLIC: dict[str, dict[str, tuple[str, ...]]] = {
         "inverse.select": ("Selection",),
         "inverse.check": ("GradientCheck",),
     },
+    "lens": {
+        "scenes.lens.foci": ("Disc", "Focus", "Importance", "Polygon", "ramped"),
+        "scenes.lens.rest_lengths": ("by_rest_lengths", "rest_length_system"),
+        "scenes.lens.scene": ("Lens",),
+        "scenes.lens.warp": ("Certificate", "Warp"),
+    },
     "linalg": {
         "linalg.base": ("LinearSolver", "SolveInfo"),
         "linalg.exact": ("ExactSolver",),
@@ -191,6 +196,7 @@ PUBLIC: dict[str, dict[str, tuple[str, ...]]] = {
         "scenes.robot.training": ("train",),
     },
     "steppers": {
+        "watch": ("Solves",),
         "forces.linearisation": ("ExactTangent", "Linearisation", "Secant", "Tangent"),
     },
     "thermal": {

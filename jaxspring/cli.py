@@ -24,6 +24,7 @@ SCENES = (
     "melting",
     "robot",
     "cloth",
+    "lens",
 )
 
 

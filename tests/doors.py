@@ -130,6 +130,7 @@ DOORS: dict[str, Door] = {
     "DataSprings": Door(lambda stiffness: js.DataSprings(image(), stiffness), {"stiffness": per_node()}),
     "Drag": Door(js.Drag, {"gamma": per_node()}),
     "EdgeField": Door(lambda value: js.topology.EdgeField((value,)), {"value": per_spring()}),
+    "Disc": Door(js.lens.Disc, {"centre": np.array([3.0, 4.0]), "radius": number(2.0), "magnification": number(1.5), "rim": number(0.5)}),
     "FixedTemperature": Door(lambda **a: js.thermal.FixedTemperature(net(), **a), {"nodes": PATTERN, "temperature": per_node(300)}),
     "Floor": Door(
         js.Floor,
@@ -202,6 +203,7 @@ DOORS: dict[str, Door] = {
     "ImageStiffness": Door(
         lambda **a: js.ImageStiffness(image(), radius=4, **a), {"k_min": number(1.0), "k_max": number(9.0), "sigma": number(1.0)}
     ),
+    "Importance": Door(lambda magnification: js.lens.Importance(js.Image(PIXELS / 30), magnification), {"magnification": number(1.5)}),
     "KES": Door(
         js.cloth.KES,
         {
@@ -252,6 +254,7 @@ DOORS: dict[str, Door] = {
     "PixelSprings": Door(lambda stiffness: js.reconstruction.PixelSprings(cast(Any, None), stiffness), {"stiffness": number(2.0)}),
     "Plane": Door(js.contact.Plane, {"point": np.array([0.0, 1.0]), "normal": np.array([0.0, 2.0])}),
     "PlasticHinges": Door(lambda **a: js.cloth.PlasticHinges(net(), **a), {"yield_angle": np.array([0.5, 0.25]), "hardening": number(0.5)}),
+    "Polygon": Door(js.lens.Polygon, {"corners": SQUARE[[0, 1, 3, 2]], "magnification": number(1.5), "rim": number(0.5)}),
     "PlainCutoff": Door(js.fluid.PlainCutoff, {"radius": number(2.5)}),
     "Pressure": Door(
         lambda **a: js.cloth.Pressure(sheet(), **a),
@@ -335,6 +338,7 @@ DOORS: dict[str, Door] = {
         lambda **a: js.cloth.provot((3, 3), 0.5, **a)[2].stiffness,
         {"stretch": np.array([100.0, 50.0]), "shear": number(20.0), "flexion": np.array([2.0, 1.0])},
     ),
+    "ramped": Door(lambda part: js.lens.ramped(js.lens.Disc((3.0, 4.0), 2.0, 1.5), part), {"part": number(0.5)}),
     "replace": Door(lambda **a: js.replace(system(), **a), {"stiffness": per_spring(), "rest_length": per_spring(), "mass": per_node()}),
     "rollout": Door(lambda dt: js.rollout(system(), state(), js.SymplecticEuler(), dt, 2).state, {"dt": number(0.0625)}),
     "rewound": Door(lambda points: js.cloth.rewound(sheet(), points).ends, {"points": CORNER}, on_host=("points",)),
@@ -400,6 +404,7 @@ DOORS: dict[str, Door] = {
 
 # Doors whose work is too long for every form of every field: tested by hand below or elsewhere.
 BY_HAND = {
+    "by_rest_lengths",
     "diffeqsolve",
     "fit",
     "fit_triangles",
@@ -409,6 +414,7 @@ BY_HAND = {
     "ground_of_points",
     "plot",
     "point_heights",
+    "rest_length_system",
     "save_obj",
     "save_ply",
     "save_stl",
@@ -419,20 +425,21 @@ BY_HAND = {
 
 # What the library makes and hands out; nobody else builds it.
 MADE_INSIDE = """
-    Account Blocks Body BoundedSurface BoundSystem Breaks BrokenSurface CellDyads Cloth ClothScene Creased Energy
-    Equilibrium Finding Fit GradientCheck Ground History Impulse Iteration Map Memory MeshReport Modes Moduli
-    NetBatch NodeDyads OdeInfo OdeResult Onset Overlay PlanarFit PointSurface Profile Reconstructed Refined Result
-    Resume Scene Selection Shell SkylineFactor SolveInfo Solves SpringBlocks SpringMatrix Status Step Subdivision
-    Surface SurfaceErrors Torn Undetermined Yielded
+    Account Blocks Body BoundedSurface BoundSystem Breaks BrokenSurface CellDyads Certificate Cloth ClothScene
+    Creased Energy Equilibrium Finding Fit GradientCheck Ground History Impulse Iteration Map Memory MeshReport
+    Modes Moduli NetBatch NodeDyads OdeInfo OdeResult Onset Overlay PlanarFit PointSurface Profile Reconstructed
+    Refined Result Resume Scene Selection Shell SkylineFactor SolveInfo Solves SpringBlocks SpringMatrix Status
+    Step Subdivision Surface SurfaceErrors Torn Undetermined Warp Yielded
 """
 
 # Objects made of options, other objects, functions or files: no array of the user's enters.
 NO_ARRAYS = """
     Adam AllPairs BDF2 BackwardEuler BackwardEulerHeat Bilinear BlockJacobi Bounded CG Cells Channel Checkpoint
     CheckpointError Checkpointed ClothSettings ConstantsSettings CrankNicolsonHeat CubicSpline Curvature Cutoff
-    EnergyLaw EqualCells ExactSolver ExactTangent ExpansionRule ExplicitHeat Flag Force ForwardEuler
-    GradientMagnitude GradientWarning GroundSettings HalfCells HeatIteration HeatScheme HeightField Holes Hooke Identity ImageError
-    ImplicitMidpoint Impulses Intensity Jacobi JaxCG LBFGS Lattice Law LeastSquares Ledger LinearSolver
+    EnergyLaw EqualCells ExactSolver ExactTangent ExpansionRule ExplicitHeat Flag Focus Force ForwardEuler
+    GradientMagnitude GradientWarning GroundSettings HalfCells HeatIteration HeatScheme HeightField Holes Hooke
+    Identity ImageError ImplicitMidpoint Impulses Intensity Jacobi JaxCG Lattice Law LBFGS LeastSquares Ledger Lens
+    LinearSolver
     Linearisation Lineax Luminance Molten Moving Multigrid Natural NeuralController Newton NoCutoff Observation
     Obstacle Optax Optimiser Ordering PairLaw Pairs PlanarSettings PointSettings Positive PowerLaw Preconditioner Progress Published PullLaw
     Reconstruction Relaxation ReverseCuthillMcKee Robot RobotSettings Rule RungeKutta4 Sampling Secant SemiImplicit

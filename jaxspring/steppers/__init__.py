@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from .._lazy import face as _face
 
 if TYPE_CHECKING:  # written by `python -m tests.face`
+    from ..watch import Solves as Solves
     from ..forces.linearisation import ExactTangent as ExactTangent
     from ..forces.linearisation import Linearisation as Linearisation
     from ..forces.linearisation import Secant as Secant

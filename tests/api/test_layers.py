@@ -57,6 +57,7 @@ LAYERS = {
     "plots": 7,
     "export": 7,  # files for viewers
     "scenes": 8,
+    "lens": 8,  # public names of a scene
     "reconstruction": 8,  # public names of a scene
     "robot": 8,  # public names of a scene and of what drives it
     "cli": 8,

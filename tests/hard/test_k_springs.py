@@ -491,6 +491,8 @@ def instances():
     ball = js.from_triangles([(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)], 4), np.eye(4, 3, -1)
     hung = js.cloth.hanging(js.cloth.ClothSettings(size=0.2, spacing=0.1))
     fold = js.cloth.Hinges(js.from_triangles([(0, 1, 2), (1, 0, 3)], 4), 1.0)
+    lens = js.lens.Lens((8, 8), nodes=5)
+    at_rest = js.Vector((lens.mesh.x, lens.mesh.y))
     classes = [
         js.thermal.Account(number, number, number, number, number, number),
         *(js.Adam(), js.LBFGS(), js.LeastSquares(), js.inverse.Optax(optax.identity()), js.Stop()),
@@ -639,7 +641,7 @@ def instances():
         ),
         *(system.bind(float), Memory(number, Owner("Heat", None), True), js.Rule(), js.Step(state, state, number)),
         *(js.Scene(TWO, number, np.dtype(float), (), ()), TWO.with_edges([(0, 1)]), js.topology.pad_nets([WHOLE, WHOLE])),
-        *(js.Equilibrium(state, info, whole, status, ("Springs",)), js.Solves(whole, number, status, info)),
+        *(js.Equilibrium(state, info, whole, status, ("Springs",)), js.steppers.Solves(whole, number, status, info)),
         *(ode, js.OdeResult(state, None, number, status, ode, None, ("Springs",)), resume),
         js.Result(state, None, status, Info(None, whole), resume, ("Springs",)),
         *(
@@ -661,6 +663,9 @@ def instances():
         *(js.cloth.Air(sheet.net, wind=(1.0, 0.0, 0.0)), js.cloth.Pressure(*ball, 1.0), js.cloth.examine(*ball)),
         *(hung, hung.settings, js.cloth.AngularJoints(js.lattice(3), 1.0), js.linalg.CellDyads(fold.triangles, (), ())),
         *(robot, robot.settings, robot.controller, js.robot.body_of_cells(("#",), 1.0)),
+        *(lens, js.lens.Warp((8, 8), lens.sampling, lens.mesh, at_rest, lens.mesh.stiffness, at_rest.x, at_rest.x, (at_rest.x,), status)),
+        *(js.lens.Disc((3.0, 4.0), 2.0, 1.5), js.lens.Polygon([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], 1.5, 0.5)),
+        *(js.lens.Importance(image.normalised(), 1.5), js.lens.Certificate(whole, number, whole)),
         *(js.robot.Oscillators([0.1], [0.0], 1.0), js.robot.Actuation(js.robot.Oscillators([0.1], [0.0], 1.0), [0])),
     ]
     return {type(a).__name__: a for a in classes}

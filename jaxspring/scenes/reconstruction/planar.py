@@ -72,7 +72,8 @@ class PlanarScene(eqx.Module):
         corners: (T, 3) nodes of the triangles.
         across: (3 T,) the triangle across each side.
         shape: (E,) stiffness at which the first mesh is at rest [N/m].
-        inside: (P,) 1 for pixels within the outline, 0 for the others.
+        area: of all pixels, over the square root of the number of cells: what areas are rounded by [m^2].
+        inside: (P,) how much pixels count: 0 outside the outline and in holes, else their weight, or 1.
     """
 
     image: Image
@@ -83,6 +84,7 @@ class PlanarScene(eqx.Module):
     corners: Int[Array, "T 3"]
     across: Int[Array, " T3"]
     shape: Float[Array, " E"]
+    area: Array
     inside: Float[Array, " P"]
 
     def __init__(self, image: Image, points: Numbers, triangles: Numbers):
@@ -101,9 +103,10 @@ class PlanarScene(eqx.Module):
         self.corners = jnp.asarray(corners)
         self.across = jnp.asarray(_across(corners))
         located = locate_pixels(self.image, places, corners)
-        if not (located.triangle >= 0).any():
-            raise ValueError("no pixel lies in any triangle. Nodes are in the unit of the image's spacing, from its origin.")
-        self.inside = jnp.asarray(located.triangle >= 0, image.dtype)
+        inside = jnp.asarray(located.triangle >= 0, image.dtype)
+        self.inside = inside if self.grid.weights is None else inside * self.grid.weights
+        if not (np.asarray(self.inside) > 0).any():
+            raise ValueError("no pixel that counts lies in any triangle. Nodes are in the unit of the image's spacing, from its origin.")
         # What areas are rounded by: of all pixels, over the square root of the number of cells.
         self.area = (self.grid.x[-1] - self.grid.x[0]) * (self.grid.y[-1] - self.grid.y[0]) / (len(corners) // 2 + 1) ** 0.5
         self.shape = jnp.asarray(cotangents(places, corners, np.asarray(self.net.edges)), image.dtype)

@@ -2,7 +2,7 @@
 
     python -m benchmarks.depth [--quick]
 
-The disparity of scikit-image's `motorcycle`, every second pixel, of which a third is withheld, pixel by pixel or in squares; the pixels
+The disparity of scikit-image's motorcycle, every second pixel, of which a third is withheld, pixel by pixel or in squares; the pixels
 without a disparity are holes already. Read: errors over the withheld pixels, in pixels of disparity; `rmse` counts the steps between things
 most, `mean` the surfaces. The rows:
 

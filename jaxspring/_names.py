@@ -196,8 +196,8 @@ PUBLIC: dict[str, dict[str, tuple[str, ...]]] = {
         "scenes.robot.training": ("train",),
     },
     "steppers": {
-        "watch": ("Solves",),
         "forces.linearisation": ("ExactTangent", "Linearisation", "Secant", "Tangent"),
+        "steppers.solves": ("Solves",),
     },
     "thermal": {
         "forces.springs": ("ExpansionRule",),

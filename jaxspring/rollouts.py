@@ -34,9 +34,10 @@ from .resume import Origin, Resume, check_kind, checksum, numbers, taken_up
 from .state import State
 from .status import EXPLANATION, WARNINGS, Flag, StabilityWarning, Status
 from .steppers.base import Stepper
+from .steppers.solves import Solves
 from .steppers.stability import dt_limit
 from .system import System, as_system
-from .watch import Carry, Precision, Solves, begin, inspect, settle
+from .watch import Carry, Precision, begin, inspect, settle
 
 
 class Info(eqx.Module):

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 from .._lazy import face as _face
 
 if TYPE_CHECKING:  # written by `python -m tests.face`
-    from ..watch import Solves as Solves
     from ..forces.linearisation import ExactTangent as ExactTangent
     from ..forces.linearisation import Linearisation as Linearisation
     from ..forces.linearisation import Secant as Secant
     from ..forces.linearisation import Tangent as Tangent
+    from .solves import Solves as Solves
     from .base import Stepper as Stepper
     from .equilibrium import Equilibrium as Equilibrium
     from .explicit import ForwardEuler as ForwardEuler

@@ -49,7 +49,7 @@ def refused(foci, match):
 
 
 def test_m5_what_cannot_be_is_refused_with_the_bound():
-    """M R >= 1, R below two cells, outside, too much together: the message names the focus and the largest feasible value."""
+    """Too wide (m R >= 1), R below two cells, outside, too much together: the message names the focus and the largest feasible value."""
     assert "below 3" in refused(js.lens.Disc((48.0, 48.0), 16.0, 3.0), r"foci\[0\]\.magnification = 3")
     # Half of it is outside, so that along x it has twice the room, but along y no more.
     assert "below 3" in refused(js.lens.Disc((0.0, 48.0), 16.0, 3.1), "largest feasible")

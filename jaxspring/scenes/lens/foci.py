@@ -31,6 +31,9 @@ class Focus(eqx.Module):
     """A part of the image that is to be magnified. Subclass it for a shape of your own: a `magnification`, and a `share`.
 
     All lengths are in pixels; x runs along the columns and y along the rows.
+
+    Attributes:
+        magnification: m, above 0; linear, of lengths.
     """
 
     magnification: eqx.AbstractVar[Array]
@@ -203,7 +206,7 @@ def faded(distance: Array, rim: Array) -> Array:
 
 
 def combined(foci: tuple[Focus, ...], x: Array, y: Array) -> tuple[Array, Array]:
-    """ln M and `a` of several foci at the nodes of a regular grid."""
+    """The logarithm of M, and `a`, of several foci at the nodes of a regular grid."""
     log_wanted, left = jnp.zeros_like(x), jnp.ones_like(x)
     for focus in foci:
         share = focus.share(x, y)
@@ -217,6 +220,9 @@ def ramped(foci: Focus | Sequence[Focus], part: Array | float) -> tuple[Focus, .
     Args:
         foci: one or several.
         part: from 0 to 1; a number, which may be traced.
+
+    Returns:
+        A tuple of the foci, with other magnifications.
 
     Raises:
         ValueError: a part that is negative.

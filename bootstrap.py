@@ -78,7 +78,7 @@ def fit(rest):
 
 def test(rest):
     """Run every test: unit tests, slow ones, docstring examples, notebooks; on as many processes as there are cores, at most 4."""
-    # Most of the suite's time is compiling, which XLA's older code for fused loops halves. `newest`, and pytest by itself, use what users do.
+    # Most of the suite's time is compiling, which XLA's older code for fused loops halves; `newest` and pytest alone use what users do.
     os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
     return run_tests(LOCKED, rest)
 

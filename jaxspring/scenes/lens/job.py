@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from ...archive import write_archive
-from ...images.files import Channel, ImageError, Luminance, elevation_model, load_image
+from ...images.channels import Channel, Luminance
+from ...images.files import ImageError, elevation_model, load_image
 from ...images.image import Image
 from ...progress import Progress, Stopwatch
 from ..command import FailedError, Written

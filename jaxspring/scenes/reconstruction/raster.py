@@ -97,9 +97,7 @@ def locate(x: Node, y: Node, flip: Flip, grid: PixelGrid, triangle: Int[Array, "
     return walk(vertices, neighbours(flip).reshape(-1), grid, triangle, area / math.sqrt(flip.size), WALKS * sum(x.shape))
 
 
-def walk(
-    vertices: list[Array], across: Int[Array, " T3"], grid: PixelGrid, triangle: Int[Array, " P"], area: Array, most: int
-) -> Location:
+def walk(vertices: list[Array], across: Int[Array, " T3"], grid: PixelGrid, triangle: Int[Array, " P"], area: Array, most: int) -> Location:
     """The walk through any triangles.
 
     Args:

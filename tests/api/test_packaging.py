@@ -36,7 +36,9 @@ def asked(lock: str) -> list[packaging.requirements.Requirement]:
         del groups["lint"]
     lists = [PYPROJECT["build-system"]["requires"], project["dependencies"]]
     lists += [*project["optional-dependencies"].values(), *groups.values()]
-    return [packaging.requirements.Requirement(text) for group in lists for text in group]
+    found = [packaging.requirements.Requirement(text) for group in lists for text in group]
+    here = {"python_version": "3.12" if lock == "requirements-newest.lock" else "3.11"}
+    return [one for one in found if one.marker is None or one.marker.evaluate(here)]
 
 
 @each_lock

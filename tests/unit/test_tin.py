@@ -46,7 +46,7 @@ def test_heights_are_numpys_least_squares(hill):
     truth = np.asarray(image.values).ravel()
     expected, *_ = np.linalg.lstsq(matrix.toarray(), truth, rcond=None)
     net = js.from_triangles(triangles, len(points))
-    np.testing.assert_allclose(fitted_heights(matrix, truth, net, membrane=1e-12), expected, atol=1e-6)
+    np.testing.assert_allclose(fitted_heights(matrix, truth, net, np.ones(len(truth)), membrane=1e-12), expected, atol=1e-6)
     tin = js.reconstruction.fitted_tin(image, points, triangles)
     error = matrix @ tin.points[:, 2] - truth
     found = tin.errors(image)
@@ -172,3 +172,32 @@ def test_swapped_sides_follow_a_ridge(hill):
     turned = js.reconstruction.swap_sides(ridge, across)
     assert {tuple(sorted(t)) for t in turned.triangles.tolist()} == {(0, 1, 3), (0, 2, 3)}
     assert turned.errors(ridge).rmse < 0.05
+
+
+def test_holes_and_weights_of_an_image_are_honoured():
+    """Heights, errors, splits, swaps and breaks: what lies under a hole counts nowhere, a weight of two counts as two pixels do."""
+    y, x = np.mgrid[:24, :24]
+    values, weights = np.where(x > 11, 1.0, 0.0) + 0.01 * y, np.where((np.hypot(x - 16, y - 8) < 4), 0.0, 1.0 + (y > 12))
+    image = js.Image(np.where(weights > 0, values, np.nan), weights=weights)
+    places = np.stack(np.meshgrid(np.linspace(0, 23, 7), np.linspace(0, 23, 7)), axis=-1).reshape(-1, 2)
+    corners = js.delaunay(places).triangles
+    located = locate_pixels(image, places, corners)
+    w, flat = surface_matrix(located, corners, 49).toarray(), weights.ravel()
+    reached = (w * flat[:, None]).sum(axis=0) > 0.5
+    z = np.linalg.lstsq(w[:, reached] * np.sqrt(flat)[:, None], np.sqrt(flat) * values.ravel(), rcond=None)[0]
+    found = js.reconstruction.fitted_tin(image, places, corners)
+    drawn, known = w @ found.points[:, 2], flat > 0
+    rms = np.sqrt(np.average((drawn - values.ravel())[known] ** 2, weights=flat[known]))
+    assert rms <= np.sqrt(np.average((w[:, reached] @ z - values.ravel())[known] ** 2, weights=flat[known])) * (1 + 1e-4)
+    errors = found.errors(image)
+    assert errors.rmse == pytest.approx(rms, rel=1e-12)
+    assert errors.greatest == pytest.approx(np.abs(drawn - values.ravel())[known].max(), rel=1e-12)
+    assert errors.outside == 0
+    # A tower stands in the hole: whoever read it would split, swap or break there.
+    lied = js.Image(np.where(weights > 0, 0.01 * y, 0.0), weights=weights)
+    lied = lied.with_values(lied.values.at[8, 16].set(50.0))
+    assert js.reconstruction.bound_error(lied, places, corners, 1e-3).n_splits == 0
+    assert js.reconstruction.break_surface(lied, places, corners, 0.5).breaks.n_broken == 0
+    assert js.reconstruction.swap_sides(image, found).errors(image).rmse <= errors.rmse
+    refined = js.reconstruction.refine_by_error(image, places, corners, 90)
+    assert np.ptp(refined.points[49:, 0]) < 12  # along the step, not around the hole

@@ -13,7 +13,7 @@ import numpy as np
 from ..._arrays import Numbers
 from ..._checks import triangle_indices
 from ...images.image import Image
-from .given import host_number, plane_points
+from .given import host_number, pixel_weights, plane_points, weighted_rms
 from .refine import Subdivision
 from .tin import Tin, fitted_heights, locate_pixels, surface_matrix
 
@@ -65,18 +65,19 @@ def bound_error(image: Image, points: Numbers, triangles: Numbers, bound: Number
     limit = host_number("bound", bound, "No surface of triangles has no error at all.")
     base = mesh = Subdivision.of(corners, len(places))
     most, truth, n_splits = image.values.size if most is None else most, np.asarray(image.values, np.float64).ravel(), 0
+    weights = pixel_weights(image)
     while True:
         now = mesh.carried(places, base)
         located = locate_pixels(image, now, mesh.triangles)
         matrix = surface_matrix(located, mesh.triangles, mesh.n_nodes)
-        z = fitted_heights(matrix, truth, mesh.net)
-        error = np.where(located.triangle < 0, 0.0, np.abs(matrix @ z - truth))
+        z = fitted_heights(matrix, truth, mesh.net, weights)
+        error = np.where((located.triangle < 0) | (weights == 0), 0.0, np.abs(matrix @ z - truth))
         greatest = np.zeros(len(mesh.triangles))
         np.maximum.at(greatest, np.maximum(located.triangle, 0), error)
         finer = mesh.refined(greatest > limit) if error.max() > limit else mesh
         if finer is mesh or finer.n_nodes > most:
             worst = divmod(int(error.argmax()), image.shape[1])
-            rmse = float(np.sqrt(np.mean(error[located.triangle >= 0] ** 2)))
+            rmse = weighted_rms(error, weights * (located.triangle >= 0))
             tin = Tin(np.column_stack([now, z]), mesh.triangles)
             return BoundedSurface(tin, float(error.max()), rmse, finer is mesh, n_splits, worst)
         mesh, n_splits = finer, n_splits + 1

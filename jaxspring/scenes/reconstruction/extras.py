@@ -18,6 +18,7 @@ from ..drawing import new_figure
 from .bounded import BoundedSurface, bound_error
 from .break_lines import length_of
 from .fitting import Reconstructed
+from .given import pixel_weights
 from .pictures import triangle_corners
 from .pieces import BrokenSurface, break_surface
 from .report import uniform_errors
@@ -137,7 +138,7 @@ def fitted_surface(found: Reconstructed) -> Tin:
 
 def greatest_errors(image: Image, found: Reconstructed) -> dict[str, dict[str, float]]:
     """The largest error of each mesh over all pixels, under both rules, in the image's unit."""
-    truth = np.asarray(image.values, np.float64)
+    truth = _known(image)
     drawn = {
         "uniform": uniform_errors(found.scene)[1:],
         "law": (found.law.image_sampled, found.law.image_best),
@@ -149,9 +150,14 @@ def greatest_errors(image: Image, found: Reconstructed) -> dict[str, dict[str, f
     }
 
 
+def _known(image: Image) -> np.ndarray:
+    """(ny, nx) the values, NaN in holes."""
+    return np.where(pixel_weights(image) > 0, np.asarray(image.values, np.float64).ravel(), np.nan).reshape(image.shape)
+
+
 def draw_breaks(path: pathlib.Path, image: Image, found: BrokenSurface) -> None:
     """The break lines over the image, and what is left of the error in one piece and broken, on one scale."""
-    values = np.asarray(image.values, np.float64)
+    values = _known(image)
     (ny, nx), (sx, sy), (ox, oy) = image.shape, map(float, image.spacing), map(float, image.origin)
     extent = (ox - sx / 2, ox + (nx - 0.5) * sx, oy + (ny - 0.5) * sy, oy - sy / 2)
     whole = found.unbroken.drawn(image) - values

@@ -6,6 +6,7 @@ import numpy as np
 
 from ..._arrays import Numbers, on_host
 from ..._checks import finite, has_shape, positive
+from ...images.image import Image
 
 
 def host_number(name: str, value: Numbers, why: str) -> float:
@@ -35,4 +36,18 @@ def plane_points(points: Numbers) -> np.ndarray:
     return places[:, :2].copy()
 
 
-__all__ = ["host_number", "plane_points"]
+def pixel_weights(image: Image) -> np.ndarray:
+    """(P,) how much each pixel counts, row by row: 1 where the image says nothing, 0 in its holes."""
+    if image.weights is None:
+        return np.ones(image.values.size)
+    return np.asarray(image.weights, np.float64).ravel()
+
+
+def weighted_rms(error: np.ndarray, weights: np.ndarray) -> float:
+    """Root mean square of errors by weights of the same shape; what is NaN does not count. Without any weight NaN."""
+    counts = ~np.isnan(error) & (weights > 0)
+    total = float(weights[counts].sum())
+    return float(np.sqrt(np.sum(weights[counts] * error[counts] ** 2) / total)) if total > 0 else float("nan")
+
+
+__all__ = ["host_number", "pixel_weights", "plane_points", "weighted_rms"]

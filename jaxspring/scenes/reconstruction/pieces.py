@@ -21,7 +21,7 @@ from ...topology.builders import from_triangles
 from .break_energy import HeightField
 from .break_lines import Faces
 from .breaks import Breaks, assembled, find_breaks
-from .given import host_number, plane_points
+from .given import host_number, pixel_weights, plane_points, weighted_rms
 from .tin import Located, Tin, fitted_heights, locate_pixels, surface_matrix
 
 # Springs along z over a node's data spring, while breaks are looked for.
@@ -78,10 +78,10 @@ def break_surface(image: Image, points: Numbers, triangles: Numbers, step: Numbe
     corners = triangle_indices("triangles", triangles, len(places))
     ratio = host_number("smoothing", smoothing, "Nothing would hold the surface together.")
     net, truth = from_triangles(corners, len(places)), np.asarray(image.values, np.float64).ravel()
-    located = locate_pixels(image, places, corners)
+    located, weights = locate_pixels(image, places, corners), pixel_weights(image)
     matrix = surface_matrix(located, corners, len(places))
-    whole = Tin(np.column_stack([places, fitted_heights(matrix, truth, net)]), corners)
-    number = np.asarray(matrix.sum(axis=0)).ravel()
+    whole = Tin(np.column_stack([places, fitted_heights(matrix, truth, net, weights)]), corners)
+    number = matrix.T @ weights
     data = np.asarray(image.sample(places[:, 0], places[:, 1]), np.float64)
     k, lowest = ratio * float(np.median(number[number > 0])), host_number("step", step, "Every spring would break.")
     breaks = find_breaks(net, places, data, k, number, lowest, image)
@@ -89,8 +89,8 @@ def break_surface(image: Image, points: Numbers, triangles: Numbers, step: Numbe
 
     def fitted(broken: Breaks) -> tuple[np.ndarray, np.ndarray, float]:
         sided = surface_matrix(sided_weights(located, corners, field.edges, broken), corners, len(places))
-        z = fitted_heights(sided, truth, net, ~broken.broken)
-        return z, sided @ z, float(np.sum((sided @ z - truth)[located.triangle >= 0] ** 2))
+        z = fitted_heights(sided, truth, net, weights, ~broken.broken)
+        return z, sided @ z, float(np.sum(weights * (located.triangle >= 0) * (sided @ z - truth) ** 2))
 
     for line in _lines(breaks):
         mended = assembled(net, field, lowest, breaks.broken & ~line, image)
@@ -98,8 +98,8 @@ def break_surface(image: Image, points: Numbers, triangles: Numbers, step: Numbe
         breaks = mended if fitted(mended)[2] < fitted(breaks)[2] else breaks
     z, surface, _ = fitted(breaks)
     drawn = np.where(located.triangle < 0, np.nan, surface)
-    error = np.abs(drawn - truth)
-    rmse, greatest = float(np.sqrt(np.nanmean(error**2))), float(np.nanmax(error))
+    error = np.where(weights > 0, np.abs(drawn - truth), np.nan)
+    rmse, greatest = weighted_rms(error, weights), float(np.nanmax(error))
     return BrokenSurface(Tin(np.column_stack([places, z]), corners), breaks, drawn.reshape(image.shape), whole, rmse, greatest)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from ..._arrays import Numbers
 from ..._checks import triangle_indices
 from ...images.image import Image
-from .given import plane_points
+from .given import pixel_weights, plane_points
 from .refine import Subdivision
 from .tin import fitted_heights, locate_pixels, surface_matrix
 
@@ -77,7 +77,7 @@ def refine_by_error(
     if n_nodes < len(places):
         raise ValueError(f"n_nodes = {n_nodes}, but the mesh has {len(places)} already. Start from a coarser one.")
     base = mesh = Subdivision.of(corners, len(places), stiffness)
-    truth = np.asarray(image.values, np.float64).ravel()
+    truth, weights = np.asarray(image.values, np.float64).ravel(), pixel_weights(image)
     seen = None if observation is None else np.asarray(observation(image), np.float64)
     if seen is not None and seen.shape != image.shape:
         raise ValueError(f"observation gives an array of shape {seen.shape} for an image of {image.shape}; expected one number per pixel.")
@@ -86,7 +86,7 @@ def refine_by_error(
         located = locate_pixels(image, mesh.carried(places, base), mesh.triangles)
         if seen is None:
             matrix = surface_matrix(located, mesh.triangles, mesh.n_nodes)
-            weight = (matrix @ fitted_heights(matrix, truth, mesh.net) - truth) ** 2
+            weight = weights * (matrix @ fitted_heights(matrix, truth, mesh.net, weights) - truth) ** 2
         else:
             weight = seen.ravel()
         inside = located.triangle >= 0

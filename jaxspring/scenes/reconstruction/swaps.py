@@ -12,6 +12,7 @@ import numpy as np
 
 from ...images.image import Image
 from ...topology.mesh_checks import Sides
+from .given import pixel_weights
 from .tin import Tin, fitted_tin, locate_pixels
 
 # A triangle thinner than this share of its longest side squared is not made.
@@ -37,26 +38,26 @@ def swap_sides(image: Image, tin: Tin, n_sweeps: int = 20) -> Tin:
     >>> swap_sides(ridge, across).errors(ridge).rmse < 0.05
     True
     """
-    truth = np.asarray(image.values, np.float64).ravel()
+    truth, weights = np.asarray(image.values, np.float64).ravel(), pixel_weights(image)
     now = fitted_tin(image, tin.points, tin.triangles)
     for _ in range(n_sweeps):
-        before = _squared(image, truth, now)
-        changed = _swept(image, truth, now)
+        before = _squared(image, truth, weights, now)
+        changed = _swept(image, truth, weights, now)
         if changed is None:
             break
         after = fitted_tin(image, now.points, changed)
-        gain = before - _squared(image, truth, after)
+        gain = before - _squared(image, truth, weights, after)
         now = after if gain > 0 else now
         if gain <= ENOUGH * before:
             break
     return now
 
 
-def _squared(image: Image, truth: np.ndarray, tin: Tin) -> float:
-    return float(np.nansum((tin.drawn(image).ravel() - truth) ** 2))
+def _squared(image: Image, truth: np.ndarray, weights: np.ndarray, tin: Tin) -> float:
+    return float(np.nansum(weights * (tin.drawn(image).ravel() - truth) ** 2))
 
 
-def _swept(image: Image, truth: np.ndarray, tin: Tin) -> np.ndarray | None:
+def _swept(image: Image, truth: np.ndarray, weights: np.ndarray, tin: Tin) -> np.ndarray | None:
     """The triangles after one sweep, or None where no swap gains."""
     points, triangles = tin.points, tin.triangles.copy()
     located = locate_pixels(image, points, triangles)
@@ -64,7 +65,7 @@ def _swept(image: Image, truth: np.ndarray, tin: Tin) -> np.ndarray | None:
     order = np.argsort(located.triangle, kind="stable")
     first = np.searchsorted(located.triangle[order], np.arange(len(triangles) + 1)).tolist()
     place = np.stack([ox + sx * (order % nx), oy + sy * (order // nx)], axis=-1)
-    value = truth[order]
+    data = np.stack([truth, weights], axis=-1)[order]
     sides = Sides(triangles)
     numbers, one, other, _ = sides.shared()
     found = []
@@ -75,7 +76,7 @@ def _swept(image: Image, truth: np.ndarray, tin: Tin) -> np.ndarray | None:
         if not _is_convex(quad):
             continue
         pixels = np.concatenate([np.arange(first[t], first[t + 1]), np.arange(first[u], first[u + 1])])
-        gain = _error(quad[[0, 1, 2, 3]], place[pixels], value[pixels]) - _error(quad[[2, 3, 0, 1]], place[pixels], value[pixels])
+        gain = _error(quad[[0, 1, 2, 3]], place[pixels], data[pixels]) - _error(quad[[2, 3, 0, 1]], place[pixels], data[pixels])
         if gain > 0:
             found.append((gain, t, u, a, b, c, d))
     used, changed = np.zeros(len(triangles), bool), False
@@ -90,8 +91,8 @@ def _swept(image: Image, truth: np.ndarray, tin: Tin) -> np.ndarray | None:
     return triangles if changed else None
 
 
-def _error(quad: np.ndarray, place: np.ndarray, value: np.ndarray) -> float:
-    """Squared error of the surface cut from corner 0 to corner 1, corners 2 and 3 beside it."""
+def _error(quad: np.ndarray, place: np.ndarray, data: np.ndarray) -> float:
+    """Squared error beside values and weights `data` (P, 2) of the surface cut from corner 0 to corner 1, corners 2 and 3 beside it."""
     a, b = quad[0], quad[1]
     beside = _cross(b[:2] - a[:2], place - a[:2]) * _cross(b[:2] - a[:2], quad[2][:2] - a[:2]) >= 0
     total = 0.0
@@ -99,7 +100,7 @@ def _error(quad: np.ndarray, place: np.ndarray, value: np.ndarray) -> float:
         u, v, p = b - a, corner - a, place[held] - a[:2]
         area = _cross(u, v)
         s, t = _cross(p, v) / area, _cross(u, p) / area
-        total += float(np.sum((a[2] + s * u[2] + t * v[2] - value[held]) ** 2))
+        total += float(np.sum(data[held, 1] * (a[2] + s * u[2] + t * v[2] - data[held, 0]) ** 2))
     return total
 
 

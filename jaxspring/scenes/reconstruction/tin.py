@@ -1,7 +1,7 @@
 """Surfaces over any triangles in the plane (TINs): which triangle holds each pixel, heights by least squares, errors.
 
     surface at a pixel    z(p) = sum w_c z_c over the corners c of its triangle, w barycentric            z_pixels = W z
-    best heights          (W'W + r L) z = W'd,   L = sum (z_i - z_j)^2 over springs, r small: nodes that no pixel reaches
+    best heights          (W'GW + r L) z = W'Gd,   G the weights of the pixels, 0 in holes,   L = sum (z_i - z_j)^2 over springs, r small: nodes that no pixel reaches
 
 On the host, in double precision; a lattice inside `jit` has `raster` and `pixels` for the same.
 """
@@ -18,7 +18,7 @@ from ..._checks import finite, triangle_indices
 from ...images.image import Image
 from ...topology.builders import from_triangles
 from ...topology.graph import Graph
-from .given import plane_points
+from .given import pixel_weights, plane_points, weighted_rms
 
 # Within so much of its edges a pixel counts as inside a triangle, in barycentric coordinates.
 EDGE = 1e-9
@@ -88,23 +88,25 @@ def surface_matrix(located: Located, triangles: np.ndarray, n_nodes: int) -> Any
     return csr_array((located.weights[inside].ravel(), (rows, columns)), shape=(len(located.triangle), n_nodes))
 
 
-def fitted_heights(matrix: Any, data: np.ndarray, net: Graph, whole: np.ndarray | None = None, membrane: float = MEMBRANE) -> np.ndarray:
-    """(N,) heights nearest to the pixels `data` (P,), with a little membrane along the springs that are whole."""
+def fitted_heights(
+    matrix: Any, data: np.ndarray, net: Graph, weights: np.ndarray, whole: np.ndarray | None = None, membrane: float = MEMBRANE
+) -> np.ndarray:
+    """(N,) heights nearest to the pixels `data` (P,) by their `weights` (P,), with a little membrane along the springs that are whole."""
     from scipy.sparse import csr_array, diags_array
     from scipy.sparse.linalg import splu
 
     n, edges = net.n_nodes, np.asarray(net.edges)
     rows, signs = np.repeat(np.arange(len(edges)), 2), np.tile([-1.0, 1.0], len(edges))
     difference = csr_array((signs, (rows, edges.ravel())), shape=(len(edges), n))
-    normal = matrix.T @ matrix
+    normal = matrix.T @ diags_array(weights) @ matrix
     ratio = membrane * max(float(normal.sum()), 1.0) / n
     held = np.ones(len(edges)) if whole is None else np.where(whole, 1.0, 1e-6)
-    middle = float(np.mean(data))
+    middle = float(np.average(data, weights=weights))
     system = normal + ratio * (difference.T @ diags_array(held) @ difference)
-    inside = np.asarray(matrix.sum(axis=1)).ravel() > 0
+    counts = weights * (np.asarray(matrix.sum(axis=1)).ravel() > 0)
     hair = 1e-13 * system.diagonal().max()
     factor = splu((system + diags_array(np.full(n, hair))).tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
-    return middle + factor.solve(matrix.T @ np.where(inside, data - middle, 0.0))
+    return middle + factor.solve(matrix.T @ (counts * (data - middle)))
 
 
 @dataclass(frozen=True)
@@ -140,11 +142,13 @@ class Tin:
         return np.where(located.triangle < 0, np.nan, drawn).reshape(image.shape)
 
     def errors(self, image: Image) -> SurfaceErrors:
-        """Root mean square and greatest error over all pixels, folds, and the smallest angle."""
-        error = np.abs(self.drawn(image) - np.asarray(image.values, np.float64))
+        """Root mean square (by the image's weights) and greatest error over all pixels but holes, folds, and the smallest angle."""
+        error = np.abs(self.drawn(image) - np.asarray(image.values, np.float64)).ravel()
+        outside, weights = int(np.isnan(error).sum()), pixel_weights(image)
         twice, angle = _areas_and_angle(self.points[:, :2], self.triangles)
         folds = int((twice * np.sign(np.median(twice)) <= 0).sum())
-        return SurfaceErrors(float(np.sqrt(np.nanmean(error**2))), float(np.nanmax(error)), folds, angle, int(np.isnan(error).sum()))
+        greatest = float(np.nanmax(np.where(weights > 0, error, np.nan)))
+        return SurfaceErrors(weighted_rms(error, weights), greatest, folds, angle, outside)
 
 
 @dataclass(frozen=True)
@@ -152,7 +156,7 @@ class SurfaceErrors:
     """What a TIN is worth on an image.
 
     Attributes:
-        rmse: root mean square error over the pixels inside [unit of the image].
+        rmse: root mean square error over the pixels inside that are no holes, by their weights [unit of the image].
         greatest: the largest error.
         folds: triangles folded over or without area.
         least_angle: the smallest angle of all triangles [degrees].
@@ -188,7 +192,7 @@ def fitted_tin(image: Image, points: Numbers, triangles: Numbers) -> Tin:
     places = plane_points(points)
     corners = triangle_indices("triangles", triangles, len(places))
     matrix = surface_matrix(locate_pixels(image, places, corners), corners, len(places))
-    z = fitted_heights(matrix, np.asarray(image.values, np.float64).ravel(), from_triangles(corners, len(places)))
+    z = fitted_heights(matrix, np.asarray(image.values, np.float64).ravel(), from_triangles(corners, len(places)), pixel_weights(image))
     return Tin(np.column_stack([places, z]), corners)
 
 

@@ -17,6 +17,7 @@ PROMISED = [
     "05_contact_and_gradients",
     "06_a_robot_that_walks",
     "07_cloth_in_measured_units",
+    "08_range_data_with_holes_and_breaks",
     "09_spring_lens",
 ]
 NOTEBOOKS = sorted((source.ROOT / "notebooks").glob("*.ipynb"))

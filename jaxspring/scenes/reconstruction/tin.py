@@ -1,7 +1,9 @@
 """Surfaces over any triangles in the plane (TINs): which triangle holds each pixel, heights by least squares, errors.
 
     surface at a pixel    z(p) = sum w_c z_c over the corners c of its triangle, w barycentric            z_pixels = W z
-    best heights          (W'GW + r L) z = W'Gd,   G the weights of the pixels, 0 in holes,   L = sum (z_i - z_j)^2 over springs, r small: nodes that no pixel reaches
+    best heights          (W'GW + r L) z = W'Gd
+
+G holds the weights of the pixels, 0 in holes; L = sum (z_i - z_j)^2 over springs, with r small, decides nodes that no pixel reaches.
 
 On the host, in double precision; a lattice inside `jit` has `raster` and `pixels` for the same.
 """

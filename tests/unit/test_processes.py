@@ -136,7 +136,8 @@ def pair(tmp_path):
             held.bind(("127.0.0.1", 0))
             address = f"127.0.0.1:{held.getsockname()[1]}"
             environment = {name: value for name, value in os.environ.items() if not name.lower().endswith("_proxy")}
-            environment |= {"XLA_FLAGS": f"--xla_force_host_platform_device_count={n_devices}", "JAX_PLATFORMS": "cpu"}
+            flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={n_devices}"
+            environment |= {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
             program = textwrap.dedent(WORKER.format(heartbeat=HEARTBEAT_S))
             for rank in (0, 1):
                 command = [sys.executable, "-c", program, task, str(rank), address, str(tmp_path)]

@@ -29,7 +29,7 @@ import jaxspring as js
 from jaxspring.progress import Stopwatch
 from jaxspring.scenes.reconstruction.extras import fitted_surface, greatest_errors
 from jaxspring.scenes.reconstruction.fitting import Reconstructed, SpringSettings, fit_springs
-from jaxspring.scenes.reconstruction.pictures import triangle_corners
+from jaxspring.scenes.reconstruction.triangles import triangle_corners
 
 from .measure import arguments, show, write
 

@@ -68,8 +68,11 @@ def _leap(scene: Passage, path: Path, i: Array) -> tuple[Path, Array]:
     found = stopped(_next_impact(*stopped((scene, path, way, bends))))
     t = jnp.where(found.is_hit, found.time, path.left)
     is_any_held = any_lane(jnp.any(jnp.stack([jnp.any(h) for h in path.held])))
-    at = lax.cond(is_any_held, lambda: slide(scene, path, t, way, bends), lambda: _flown(scene, path, t))
-    slowed = way.acceleration - braking(scene, path, way, bends)
+    at, slowed = lax.cond(
+        is_any_held,
+        lambda: (slide(scene, path, t, way, bends), way.acceleration - braking(scene, path, way, bends)),
+        lambda: (_flown(scene, path, t), way.acceleration),
+    )
     at, reaches = _refined(scene, at, path.left, slowed, found, i >= MOST - 2)
     is_hit = found.is_hit & reaches
     after = thrown(scene, at, way.acceleration, found.chosen, is_hit, i >= LATE)

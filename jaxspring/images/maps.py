@@ -14,12 +14,12 @@ Source: OGC GeoTIFF Standard 1.1 (19-008r4), sections 7.1.2 and B.6.
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from .channels import OneChannel, Pixels
+from .channels import OneChannel
 from .files import MAX_PIXELS, image_of, usable
 from .holes import Holes
 from .image import Image
@@ -78,14 +78,7 @@ def load_map(
             stream.seek(0)
             place = _place(read_place(stream, page), pixels.values.shape[0])
         # A view turned upside down; masks turn with it.
-        turned = Pixels(
-            pixels.values[::-1],
-            pixels.nodata,
-            None if pixels.mask is None else pixels.mask[::-1],
-            pixels.alpha,
-            pixels.is_premultiplied,
-            pixels.has_bands,
-        )
+        turned = replace(pixels, values=pixels.values[::-1], mask=None if pixels.mask is None else pixels.mask[::-1])
         image = image_of(turned, channel, place.spacing, 0.0, fill, holes)
         return Map(image, place.corner, place.is_in_degrees, place.epsg)
 

@@ -22,7 +22,7 @@ from jaxtyping import Array
 from ..._checks import is_concrete
 from ...status import Flag, Status
 from .foci import Focus, combined
-from .mesh import LensMesh
+from .mesh import LensMesh, at_cells
 
 
 def largest(focus: Focus, shape: tuple[int, int]) -> Array:
@@ -35,7 +35,7 @@ def largest(focus: Focus, shape: tuple[int, int]) -> Array:
     return room.astype(focus.magnification.dtype)
 
 
-def narrowest(focus: Focus, mesh: LensMesh, shape: tuple[int, int]) -> Array:
+def narrowest(focus: Focus, mesh: LensMesh) -> Array:
     """Width of a focus in cells of the mesh, along the axis where it has fewest; infinite where it has no edge."""
     extent = focus.extent()
     if extent is None:
@@ -50,7 +50,7 @@ def filled(foci: tuple[Focus, ...], mesh: LensMesh) -> Array:
     """Part of the image's area that is shown magnified; the rest is left to the context. Shrunk foci ask for no room."""
     log_wanted, share = combined(foci, mesh.x, mesh.y)
     area = jnp.where((share > 0.5) & (log_wanted > 0), jnp.exp(2 * log_wanted), jnp.zeros_like(share))
-    return jnp.mean(0.25 * (area[:-1, :-1] + area[:-1, 1:] + area[1:, :-1] + area[1:, 1:]))
+    return jnp.mean(at_cells(area))
 
 
 def check_feasible(foci: tuple[Focus, ...], mesh: LensMesh, shape: tuple[int, int]) -> None:
@@ -64,7 +64,7 @@ def check_feasible(foci: tuple[Focus, ...], mesh: LensMesh, shape: tuple[int, in
             raise ValueError(
                 f"foci[{i}] lies outside the image, whose pixels run from 0 to {shape[1] - 1} along x and 0 to {shape[0] - 1} along y."
             )
-        cells = float(narrowest(focus, mesh, shape))
+        cells = float(narrowest(focus, mesh))
         if cells < 2:
             raise ValueError(
                 f"foci[{i}] is {cells:.2g} cells of the mesh wide: too few springs see it. Make it {2 / cells:.3g} times larger, or pass "
@@ -88,7 +88,7 @@ def feasibility(foci: tuple[Focus, ...], mesh: LensMesh, shape: tuple[int, int])
     """INVALID where foci are not feasible, for those that are traced."""
     is_wrong = filled(foci, mesh) >= 1
     for focus in foci:
-        is_wrong |= ~(focus.magnification < largest(focus, shape)) | ~(narrowest(focus, mesh, shape) >= 2)
+        is_wrong |= ~(focus.magnification < largest(focus, shape)) | ~(narrowest(focus, mesh) >= 2)
     return Status.when(Flag.INVALID, is_wrong)
 
 

@@ -197,6 +197,11 @@ class Importance(Focus):
         return rows @ self.image.values.astype(x.dtype) @ columns.T
 
 
+def several(foci: Focus | Sequence[Focus]) -> tuple[Focus, ...]:
+    """One focus, or several, as a tuple."""
+    return (foci,) if isinstance(foci, Focus) else tuple(foci)
+
+
 def faded(distance: Array, rim: Array) -> Array:
     """1 where the signed distance from an edge is negative, 0 beyond the rim, smooth between."""
     t = distance / rim
@@ -230,9 +235,8 @@ def ramped(foci: Focus | Sequence[Focus], part: Array | float) -> tuple[Focus, .
     >>> print(ramped(Disc((10.0, 10.0), 5.0, magnification=4.0), 0.5)[0].magnification)
     2.0
     """
-    several = (foci,) if isinstance(foci, Focus) else tuple(foci)
     power = constant("part", part, "A ramp begins at nothing.", may_be_zero=True)
-    return tuple(eqx.tree_at(lambda f: f.magnification, f, f.magnification ** power.astype(f.magnification.dtype)) for f in several)
+    return tuple(eqx.tree_at(lambda f: f.magnification, f, f.magnification ** power.astype(f.magnification.dtype)) for f in several(foci))
 
 
 def _hats(nodes: Array, n: int, spacing: Array, origin: Array) -> Array:
@@ -253,4 +257,4 @@ def _rim(value: Array | float) -> Array:
     return constant("rim", value, "Without a rim the magnification jumps, and so does the derivative by the radius.")
 
 
-__all__ = ["Disc", "Extent", "Focus", "Importance", "Polygon", "combined", "faded", "ramped"]
+__all__ = ["Disc", "Extent", "Focus", "Importance", "Polygon", "combined", "faded", "ramped", "several"]

@@ -16,10 +16,9 @@ one axis and cosines along the other, between square roots of the ratio of the d
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -33,7 +32,6 @@ from ...vector import Vector
 from ..reconstruction.triangles import Node
 from .search import turned
 
-Tree = TypeVar("Tree")
 # Stiffness of a diagonal over that of a row: enough that the triangles, not the cells, decide on folds.
 DIAGONAL = 0.2
 
@@ -104,23 +102,20 @@ class LensMesh(eqx.Module):
 
     def balance(self, stiffness: EdgeField, guess: Vector, solver: JaxCG) -> tuple[Vector, SolveInfo]:
         """Displacements (x, y) at which springs of this stiffness balance [pixels]; positive wherever the mesh has a spring."""
-        free = self.is_free
-
-        def hold(a: Vector) -> Vector:
-            return Vector(tuple(jnp.where(f, part, jnp.zeros_like(part)) for f, part in zip(free, a, strict=True)))
+        free = tuple(self.is_free)
 
         def product(a: Vector) -> Vector:
-            return -hold(self.net.net_pull(lambda d, w: w * d, hold(a), stiffness))
+            return -self.net.net_pull(lambda d, w: w * d, a.where(free), stiffness).where(free)
 
-        pull = hold(self.net.net_pull(lambda d, w: w * d, Vector((self.x, self.y)), stiffness))
+        pull = self.net.net_pull(lambda d, w: w * d, Vector((self.x, self.y)), stiffness).where(free)
         scale = lax.rsqrt(lax.stop_gradient(self.net.incident_sum(stiffness) / self.net.incident_sum(self.stiffness)))
 
         def precondition(r: Vector) -> Vector:
-            return hold(Vector((scale * self.modes.along_x(scale * r[0]), scale * self.modes.along_y(scale * r[1]))))
+            return Vector((scale * self.modes.along_x(scale * r[0]), scale * self.modes.along_y(scale * r[1]))).where(free)
 
         moved, info = solver.solve(product, pull, precondition, guess)
         # Held again, so that what asks for the derivative at a held node gets zero, not an equation without a solution.
-        return hold(moved), info
+        return moved.where(free), info
 
 
 class _Axis(NamedTuple):
@@ -174,9 +169,9 @@ class _Modes(eqx.Module):
         return a @ in_modes @ b.T
 
 
-def cast(tree: Tree, dtype: jnp.dtype) -> Tree:
-    """A tree with all its floating arrays in one type."""
-    return jax.tree.map(lambda a: a.astype(dtype) if eqx.is_inexact_array(a) else a, tree)
+def at_cells(a: Array) -> Array:
+    """Mean over the four corners of every cell."""
+    return 0.25 * (a[:-1, :-1] + a[:-1, 1:] + a[1:, :-1] + a[1:, 1:])
 
 
-__all__ = ["DIAGONAL", "LensMesh", "cast"]
+__all__ = ["DIAGONAL", "LensMesh", "at_cells"]

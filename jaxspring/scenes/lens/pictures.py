@@ -8,11 +8,10 @@ from __future__ import annotations
 import pathlib
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from ..drawing import new_figure
-from ..reconstruction.triangles import corners
+from ..reconstruction.triangles import triangle_corners
 from .search import turned
 from .warp import Warp
 
@@ -96,9 +95,7 @@ def draw_animation(path: pathlib.Path, frames: list[np.ndarray]) -> None:
 
 def triangle_nodes(warp: Warp) -> np.ndarray:
     """(T, 3) node numbers of the triangles."""
-    shape = warp.mesh.net.node_shape
-    numbers = jnp.arange(shape[0] * shape[1]).reshape(shape)
-    return np.stack([np.ravel(c) for c in corners(numbers, jnp.asarray(turned(warp.mesh.cells)))], axis=-1)
+    return triangle_corners(turned(warp.mesh.cells))
 
 
 def _cells(axes: Any, warp: Warp, values: np.ndarray, cmap: str, vmin: float, vmax: float | None = None) -> Any:

@@ -24,7 +24,7 @@ from ...status import Status
 from ...steppers.equilibrium import equilibrium
 from ...system import System
 from ...topology.edge_field import EdgeField
-from .foci import Focus, combined
+from .foci import combined, several
 from .mesh import LensMesh
 from .scene import Foci, Lens
 from .warp import Warp
@@ -87,8 +87,7 @@ def by_rest_lengths(
         system = _system(mesh, log_wanted * (step / n_steps), share, tension, firmness)
         found = equilibrium(system, state, tolerance=tolerance)
         state, status = found.state, status.then(found.status)
-    foci = (foci,) if isinstance(foci, Focus) else tuple(foci)
-    shares = tuple(focus.share(mesh.x, mesh.y) for focus in foci)
+    shares = tuple(focus.share(mesh.x, mesh.y) for focus in several(foci))
     stiffness, rest = _constants(mesh, log_wanted, share, tension, firmness)
     length = mesh.net.difference(state.position).map(lambda d: jnp.sqrt(d.dot(d)))
     weight = stiffness.map(lambda k, l0, r: k * (1 - l0 / r), rest, length)
@@ -96,8 +95,7 @@ def by_rest_lengths(
 
 
 def _wanted(mesh: LensMesh, foci: Foci) -> tuple[Array, Array]:
-    foci = (foci,) if isinstance(foci, Focus) else tuple(foci)
-    return combined(foci, mesh.x, mesh.y)
+    return combined(several(foci), mesh.x, mesh.y)
 
 
 def _constants(

@@ -33,12 +33,13 @@ from jaxtyping import Array
 from ..._checks import kind
 from ...images.sampling import Bilinear, Sampling
 from ...linalg.cg import JaxCG
+from ...numerics import cast_inexact
 from ...status import Status
 from ...topology.edge_field import EdgeField
 from ...vector import Vector
 from .feasible import check_feasible, feasibility
-from .foci import Focus, combined
-from .mesh import LensMesh, cast
+from .foci import Focus, combined, several
+from .mesh import LensMesh
 from .warp import Picture, Warp
 
 Foci = Focus | Sequence[Focus]
@@ -122,13 +123,13 @@ class Lens(eqx.Module):
                 magnification that fits. Where they are traced, the warp's status says INVALID instead.
             TypeError: not foci.
         """
-        foci = (foci,) if isinstance(foci, Focus) else tuple(foci)
+        foci = several(foci)
         for i, focus in enumerate(foci):
             kind(f"foci[{i}]", focus, Focus, "js.lens.Disc((100.0, 80.0), 30.0, 2.0)")
         if not foci:
             raise ValueError("foci is empty: there is nothing to magnify. Pass one focus or more.")
         dtype = jnp.result_type(jax.tree.leaves(eqx.filter(foci[0], eqx.is_inexact_array))[0])
-        mesh, foci = cast(self.mesh, dtype), tuple(cast(focus, dtype) for focus in foci)
+        mesh, foci = cast_inexact(self.mesh, dtype), tuple(cast_inexact(focus, dtype) for focus in foci)
         check_feasible(foci, mesh, self.shape)
         log_wanted, share = combined(foci, mesh.x, mesh.y)
         moved, stiffness, status = self._calibrated(mesh, log_wanted, share)

@@ -19,12 +19,12 @@ from ...forces.springs import Springs
 from ...images.image import Image
 from ...images.sampling import Sampling
 from ...images.surface import Surface
-from ...status import Flag, Status
+from ...status import Status
 from ...system import System
 from ...topology.edge_field import EdgeField
 from ...vector import Vector
 from ..reconstruction.triangles import doubled_areas
-from .mesh import LensMesh
+from .mesh import LensMesh, at_cells
 from .search import Affine, search, triangle_at, turned
 
 Picture = TypeVar("Picture", Image, Array)
@@ -127,7 +127,7 @@ class Warp(eqx.Module):
     @property
     def wanted(self) -> Float[Array, "my mx"]:
         """The magnification M that the foci want of every cell: 1 in the context, which cannot have it."""
-        return jnp.exp(_at_cells(self.log_wanted))
+        return jnp.exp(at_cells(self.log_wanted))
 
     @property
     def anisotropy(self) -> Float[Array, "2 my mx"]:
@@ -147,7 +147,7 @@ class Warp(eqx.Module):
     @property
     def requested(self) -> Float[Array, " L"]:
         """What each focus asked for, with what others ask for where they overlap, by the same mean."""
-        return jnp.stack([self._mean_over(share, _at_cells(self.log_wanted)) for share in self.shares])
+        return jnp.stack([self._mean_over(share, at_cells(self.log_wanted)) for share in self.shares])
 
     def system(self, firmness: float = FIRMNESS) -> System:
         """The net as springs with rest lengths, whose equilibrium is this mesh: to run, to load, to look at.
@@ -226,16 +226,4 @@ class Warp(eqx.Module):
         return jnp.exp(jnp.sum(weight * values) / jnp.sum(weight))
 
 
-def lost(warp: Warp) -> Status:
-    """OUTSIDE, and how many, where pixels are in no triangle: none, where the certificate holds."""
-    x, y = (jnp.ravel(a) for a in warp._pixels())
-    found = search(Affine.between(warp.position.x, warp.position.y, warp.mesh.x, warp.mesh.y), x, y, warp.mesh.cells, warp.mesh.cell_size)
-    return Status.when(Flag.OUTSIDE, found.n_lost > 0, count=found.n_lost)
-
-
-def _at_cells(a: Array) -> Array:
-    """Mean over the four corners of every cell."""
-    return 0.25 * (a[:-1, :-1] + a[:-1, 1:] + a[1:, :-1] + a[1:, 1:])
-
-
-__all__ = ["Certificate", "Warp", "lost"]
+__all__ = ["Certificate", "Warp"]

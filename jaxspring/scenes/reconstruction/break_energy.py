@@ -16,6 +16,7 @@ import numpy as np
 from ..._arrays import Numbers, on_host
 from ..._checks import finite, has_shape, nonnegative
 from ...topology.base import Topology
+from .given import differences, factored
 
 # A spring is not broken where it alone holds a part that has no data: there 1/k - b' A^-1 b is rounding.
 LOOSE = 1e-9
@@ -68,17 +69,13 @@ class Fitted:
     """The surface in balance with some springs broken, and A^-1 b of springs as it is asked for."""
 
     def __init__(self, field: HeightField, broken: np.ndarray):
-        from scipy.sparse import csr_array, diags_array
-        from scipy.sparse.linalg import splu
+        from scipy.sparse import diags_array
 
-        self._field, (n_springs, n) = field, (len(broken), len(field.data))
-        rows, signs = np.repeat(np.arange(n_springs), 2), np.tile([-1.0, 1.0], n_springs)
-        difference = csr_array((signs, (rows, field.edges.ravel())), shape=(n_springs, n))
+        self._field, difference = field, differences(field.edges, len(field.data))
         k = np.where(broken, 0.0, field.stiffness)
         matrix = difference.T @ diags_array(k) @ difference + diags_array(field.data_stiffness)
         # A whole net without data anywhere in a piece has no height there: a hair of its own diagonal chooses one.
-        hair = 1e-14 * matrix.diagonal().max()
-        self._lu = splu((matrix + diags_array(np.full(n, hair))).tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+        self._lu = factored(matrix, 1e-14)
         self.z = self._lu.solve(field.data_stiffness * field.data)
         self.extension = difference @ self.z
         self.energy = float(0.5 * k @ self.extension**2 + 0.5 * field.data_stiffness @ (self.z - field.data) ** 2)

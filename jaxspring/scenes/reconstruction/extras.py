@@ -18,12 +18,13 @@ from ..drawing import new_figure
 from .bounded import BoundedSurface, bound_error
 from .break_lines import length_of
 from .fitting import Reconstructed
-from .given import pixel_weights
-from .pictures import triangle_corners
+from .given import seen
+from .pictures import extent_of
 from .pieces import BrokenSurface, break_surface
 from .report import uniform_errors
 from .tin import Tin
 from .tin_files import save_tin
+from .triangles import triangle_corners
 
 
 @dataclass(frozen=True)
@@ -138,7 +139,7 @@ def fitted_surface(found: Reconstructed) -> Tin:
 
 def greatest_errors(image: Image, found: Reconstructed) -> dict[str, dict[str, float]]:
     """The largest error of each mesh over all pixels, under both rules, in the image's unit."""
-    truth = _known(image)
+    truth = seen(image)
     drawn = {
         "uniform": uniform_errors(found.scene)[1:],
         "law": (found.law.image_sampled, found.law.image_best),
@@ -150,19 +151,13 @@ def greatest_errors(image: Image, found: Reconstructed) -> dict[str, dict[str, f
     }
 
 
-def _known(image: Image) -> np.ndarray:
-    """(ny, nx) the values, NaN in holes."""
-    return np.where(pixel_weights(image) > 0, np.asarray(image.values, np.float64).ravel(), np.nan).reshape(image.shape)
-
-
 def draw_breaks(path: pathlib.Path, image: Image, found: BrokenSurface) -> None:
     """The break lines over the image, and what is left of the error in one piece and broken, on one scale."""
-    values = _known(image)
-    (ny, nx), (sx, sy), (ox, oy) = image.shape, map(float, image.spacing), map(float, image.origin)
-    extent = (ox - sx / 2, ox + (nx - 0.5) * sx, oy + (ny - 0.5) * sy, oy - sy / 2)
+    values = seen(image)
+    extent = left, right, bottom, top = extent_of(image)
     whole = found.unbroken.drawn(image) - values
     limit = float(np.nanpercentile(np.abs(whole), 99)) or 1.0
-    figure = new_figure(15, 5 * min(max(ny * sy / (nx * sx), 0.3), 2.0) + 0.7, 110, "compressed")
+    figure = new_figure(15, 5 * min(max((bottom - top) / (right - left), 0.3), 2.0) + 0.7, 110, "compressed")
     axes = figure.subplots(1, 3)
     axes[0].imshow(values, cmap="gray", extent=extent)
     for line in found.breaks.lines:

@@ -33,7 +33,7 @@ from ..._checks import as_inexact, positive
 from ...images.points import PointCloud
 from .points import places_of
 from .raster import draw, locate
-from .triangles import Node, count_folds
+from .triangles import Node, refuse_folds
 
 DAMPING = 0.01
 RELAXED = 0.9
@@ -127,8 +127,7 @@ def ground_of_points(
     if x.ndim != 2 or min(x.shape) < 3 or y.shape != x.shape:
         raise ValueError(f"mesh has x of shape {x.shape} and y of shape {y.shape}; a cloth needs one shape (ny, nx), 3 x 3 at least.")
     flip = jnp.zeros((x.shape[0] - 1, x.shape[1] - 1), bool)
-    if int(folds := count_folds(x, y, flip)):
-        raise ValueError(f"{int(folds)} triangles of the mesh are folded over or have no area: points would be in several. Relax it.")
+    refuse_folds(x, y, flip)
     inside, grid, start = places_of(cloud, x, y)
     z = cloud.z[jnp.asarray(np.flatnonzero(inside))]
     # Counted from the lowest point, so that float32 keeps its digits where land is high.
@@ -201,12 +200,10 @@ def fall(x: Node, y: Node, floor: Node, drop: Array, still: Array, step: Array, 
 
 def _laid(floor: Node, held: Array, step: Array) -> Array:
     """Held nodes, and all that are joined to one by neighbours whose floors differ by less than `step`."""
-    ny, nx = floor.shape
-    row, column = np.indices((ny, nx))
 
     def spread(held: Array) -> Array:
         for down, right in ((0, 1), (1, 0), (0, -1), (-1, 0)):
-            exists = (row >= down) & (row < ny + down) & (column >= right) & (column < nx + right)
+            exists = _exists(floor.shape, down, right)
             other = jnp.roll(floor, (down, right), (0, 1))
             near = jnp.where(jnp.isfinite(floor) & jnp.isfinite(other), jnp.abs(floor - jnp.where(jnp.isfinite(other), other, 0)), jnp.inf)
             held = held | (jnp.roll(held, (down, right), (0, 1)) & exists & (near < step))
@@ -220,15 +217,19 @@ def _laid(floor: Node, held: Array, step: Array) -> Array:
 
 def _tension(x: Node, y: Node) -> list[Node]:
     """1/d of every neighbour over the sum of all, zero where there is none, in the order of NEIGHBOURS as `jnp.roll` shifts."""
-    ny, nx = x.shape
-    row, column = np.indices((ny, nx))
     weights = []
     for down, right in NEIGHBOURS:
-        exists = (row >= down) & (row < ny + down) & (column >= right) & (column < nx + right)
+        exists = _exists(x.shape, down, right)
         away = jnp.hypot(x - jnp.roll(x, (down, right), (0, 1)), y - jnp.roll(y, (down, right), (0, 1)))
         weights.append(jnp.where(exists, 1 / jnp.where(exists, away, 1), 0).astype(x.dtype))
     total = sum(weights[1:], weights[0])
     return [w / total for w in weights]
+
+
+def _exists(shape: tuple[int, ...], down: int, right: int) -> np.ndarray:
+    """(ny, nx) where what `jnp.roll` shifts to a node by so many rows and columns is a neighbour, not one from beyond the other border."""
+    row, column = np.indices(shape)
+    return (row >= down) & (row < shape[0] + down) & (column >= right) & (column < shape[1] + right)
 
 
 def _even(cloud: PointCloud, resolution: float) -> tuple[Array, Array]:

@@ -8,14 +8,14 @@ from __future__ import annotations
 import pathlib
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from ...images.image import Image
 from ..drawing import canvas_and_figure
 from .fitting import Reconstructed
-from .report import rms, uniform_errors
-from .triangles import corners
+from .given import pixel_weights, seen, weighted_rms
+from .report import uniform_errors
+from .triangles import triangle_corners
 
 DPI = 130
 
@@ -27,8 +27,8 @@ def draw_pictures(folder: pathlib.Path, image: Image, found: Reconstructed) -> t
         ImportError: matplotlib is not installed.
     """
     canvas, figure_of = canvas_and_figure()
-    values = _seen(image)
-    left, right, bottom, top = _extent(image)
+    values = seen(image)
+    left, right, bottom, top = extent_of(image)
     width = min(6.0, 4.5 * max((right - left) / (bottom - top), 0.5))
     height = max(width * (bottom - top) / (right - left), 1.0) + 0.7  # inches, with title and labels
     uniform_sampled, uniform_best = uniform_errors(found.scene)[1:]
@@ -55,19 +55,7 @@ def draw_pictures(folder: pathlib.Path, image: Image, found: Reconstructed) -> t
     return tuple(drawings)
 
 
-def triangle_corners(flip: np.ndarray) -> np.ndarray:
-    """(T, 3) node numbers of every triangle of a lattice whose cells are cut along `flip`."""
-    ny, nx = (n + 1 for n in flip.shape)
-    return np.stack([np.ravel(corner) for corner in corners(jnp.arange(ny * nx).reshape(ny, nx), jnp.asarray(flip))], axis=-1)
-
-
-def _seen(image: Image) -> np.ndarray:
-    """The pixels, NaN in holes: there the pictures stay empty."""
-    values = np.asarray(image.values, np.float64)
-    return values if image.weights is None else np.where(np.asarray(image.weights) > 0, values, np.nan)
-
-
-def _extent(image: Image) -> tuple[float, float, float, float]:
+def extent_of(image: Image) -> tuple[float, float, float, float]:
     """Outer edges of the outermost pixels, for rows that run down."""
     (ny, nx), (sx, sy), (ox, oy) = image.shape, map(float, image.spacing), map(float, image.origin)
     return (ox - sx / 2, ox + (nx - 0.5) * sx, oy + (ny - 0.5) * sy, oy - sy / 2)
@@ -85,7 +73,7 @@ def _meshes(figure: Any, image: Image, values: np.ndarray, found: Reconstructed)
     straight = np.zeros_like(found.fitted.flip)
     panels = (("image", None), ("uniform mesh", (x, y, straight)), ("fitted mesh", (found.fitted.x, found.fitted.y, found.fitted.flip)))
     for axes, (title, mesh) in zip(figure.subplots(1, 3), panels, strict=True):
-        axes.imshow(values, cmap="gray", extent=_extent(image))
+        axes.imshow(values, cmap="gray", extent=extent_of(image))
         if mesh is not None:
             axes.triplot(np.ravel(mesh[0]), np.ravel(mesh[1]), triangle_corners(mesh[2]), color="tab:orange", linewidth=0.35)
         axes.set_title(title)
@@ -96,7 +84,7 @@ def _meshes(figure: Any, image: Image, values: np.ndarray, found: Reconstructed)
 def _reconstructions(figure: Any, image: Image, values: np.ndarray, surfaces: dict[str, tuple[np.ndarray, np.ndarray]]) -> Any:
     panels = [("image", values), *((f"{name}, best heights", best) for name, (_, best) in surfaces.items())]
     for axes, (title, picture) in zip(figure.subplots(1, 4), panels, strict=True):
-        axes.imshow(picture, cmap="gray", extent=_extent(image), vmin=np.nanmin(values), vmax=np.nanmax(values))
+        axes.imshow(picture, cmap="gray", extent=extent_of(image), vmin=np.nanmin(values), vmax=np.nanmax(values))
         axes.set_title(title)
         _label(axes, image)
     figure.colorbar(figure.axes[0].images[0], ax=figure.axes, label="value of the image", fraction=0.03, pad=0.01)
@@ -110,8 +98,8 @@ def _errors(figure: Any, image: Image, values: np.ndarray, surfaces: dict[str, t
     for rule, (row, label) in enumerate(zip(rows, ("sampled", "best"), strict=True)):
         for axes, (name, pair) in zip(row, surfaces.items(), strict=True):
             error = pair[rule] - values
-            axes.imshow(error, cmap="RdBu_r", extent=_extent(image), vmin=-limit, vmax=limit)
-            axes.set_title(f"{name}, {label} heights: rmse {rms(np.nan_to_num(error), image.weights):.4g}")
+            axes.imshow(error, cmap="RdBu_r", extent=extent_of(image), vmin=-limit, vmax=limit)
+            axes.set_title(f"{name}, {label} heights: rmse {weighted_rms(error, pixel_weights(image)):.4g}")
             _label(axes, image)
     figure.colorbar(figure.axes[0].images[0], ax=figure.axes, label="surface minus image", fraction=0.03, pad=0.01)
     return figure

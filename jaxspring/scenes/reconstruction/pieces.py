@@ -92,11 +92,13 @@ def break_surface(image: Image, points: Numbers, triangles: Numbers, step: Numbe
         z = fitted_heights(sided, truth, net, weights, ~broken.broken)
         return z, sided @ z, float(np.sum(weights * (located.triangle >= 0) * (sided @ z - truth) ** 2))
 
+    best = fitted(breaks)
     for line in _lines(breaks):
         mended = assembled(net, field, lowest, breaks.broken & ~line, image)
+        tried = fitted(mended)
         # A slope that is steep but has no edge: the pixels are nearer to the surface in one piece.
-        breaks = mended if fitted(mended)[2] < fitted(breaks)[2] else breaks
-    z, surface, _ = fitted(breaks)
+        breaks, best = (mended, tried) if tried[2] < best[2] else (breaks, best)
+    z, surface, _ = best
     drawn = np.where(located.triangle < 0, np.nan, surface)
     error = np.where(weights > 0, np.abs(drawn - truth), np.nan)
     rmse, greatest = weighted_rms(error, weights), float(np.nanmax(error))

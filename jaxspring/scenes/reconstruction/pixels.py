@@ -103,18 +103,24 @@ class Moments(eqx.Module):
     def _barycentric(self, x: Node, y: Node, flip: Flip) -> tuple[PlaneOf, PlaneOf, PlaneOf]:
         """Each weight as a plane (constant, slope in px, slope in py) over its triangle."""
         (ax, bx, cx), (ay, by, cy) = self._local(x, self.origin[0], flip), self._local(y, self.origin[1], flip)
-        area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-        inverse = 1 / jnp.where(area == 0, jnp.ones_like(area), area)
-        return (
-            ((bx * cy - by * cx) * inverse, (by - cy) * inverse, (cx - bx) * inverse),
-            ((cx * ay - cy * ax) * inverse, (cy - ay) * inverse, (ax - cx) * inverse),
-            ((ax * by - ay * bx) * inverse, (ay - by) * inverse, (bx - ax) * inverse),
-        )
+        return barycentric_planes((ax, ay), (bx, by), (cx, cy))
 
     def _plane(self, x: Node, y: Node, z: Node, flip: Flip) -> tuple[Array, Array, Array]:
         p, q, r = (c - MIDDLE for c in corners(z, flip))
         u, v, w = self._barycentric(x, y, flip)
         return u[0] * p + v[0] * q + w[0] * r, u[1] * p + v[1] * q + w[1] * r, u[2] * p + v[2] * q + w[2] * r
+
+
+def barycentric_planes(a: tuple[Array, Array], b: tuple[Array, Array], c: tuple[Array, Array]) -> tuple[PlaneOf, PlaneOf, PlaneOf]:
+    """The weights of the corners (x, y) of any triangles, each as a plane; a triangle without area counts as one of twice that area 1."""
+    (ax, ay), (bx, by), (cx, cy) = a, b, c
+    area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+    inverse = 1 / jnp.where(area == 0, jnp.ones_like(area), area)
+    return (
+        ((bx * cy - by * cx) * inverse, (by - cy) * inverse, (cx - bx) * inverse),
+        ((cx * ay - cy * ax) * inverse, (cy - ay) * inverse, (ax - cx) * inverse),
+        ((ax * by - ay * bx) * inverse, (ay - by) * inverse, (bx - ax) * inverse),
+    )
 
 
 class NormalEquations(eqx.Module):

@@ -44,7 +44,7 @@ from ...topology.edge_field import EdgeField
 from ...topology.graph import Graph
 from ...topology.mesh_checks import Sides
 from .border import SlidingBorder
-from .given import plane_points
+from .given import cross, plane_points, springs_along
 from .planar_pixels import PixelSums, PlanarHeights
 from .raster import PixelGrid, walk
 from .scene import Relaxation
@@ -314,12 +314,11 @@ def doubled_areas(points: Array, corners: Array) -> Array:
 def cotangents(points: np.ndarray, corners: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """(E,) half the sum of the cotangents of the angles across each side, at least `LEAST` of their median."""
     total = np.zeros(len(edges))
-    keys = edges.astype(np.int64) @ [len(points), 1]
     for i in range(3):
         a, b, c = corners[:, i], corners[:, (i + 1) % 3], corners[:, (i + 2) % 3]
         u, v = points[b] - points[a], points[c] - points[a]
-        twice = np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
-        place = np.searchsorted(keys, np.sort(np.stack([b, c], axis=-1), axis=1).astype(np.int64) @ [len(points), 1])
+        twice = np.abs(cross(u, v))
+        place = springs_along(edges, np.stack([b, c], axis=-1), len(points))
         np.add.at(total, place, 0.5 * (u * v).sum(axis=1) / np.where(twice > 0, twice, 1))
     return np.maximum(total, LEAST * np.median(total[total > 0]))
 
@@ -327,8 +326,7 @@ def cotangents(points: np.ndarray, corners: np.ndarray, edges: np.ndarray) -> np
 def wound(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """The triangles, all wound so that their area is positive."""
     a, b, c = (points[triangles[:, i]] for i in range(3))
-    negative = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0] < 0
-    return np.where(negative[:, None], triangles[:, [0, 2, 1]], triangles)
+    return np.where((cross(b - a, c - a) < 0)[:, None], triangles[:, [0, 2, 1]], triangles)
 
 
 def _across(corners: np.ndarray) -> np.ndarray:

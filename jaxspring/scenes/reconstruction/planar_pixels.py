@@ -14,10 +14,8 @@ from jaxtyping import Array, Float, Int
 from ...linalg.cg import JaxCG
 from ...topology.graph import Graph
 from ...vector import Vector
+from .pixels import MIDDLE, PlaneOf, barycentric_planes
 from .raster import PixelGrid, read
-
-MIDDLE = 0.5
-Planes = tuple[Array, Array, Array]
 
 
 class PixelSums(eqx.Module):
@@ -44,16 +42,10 @@ class PixelSums(eqx.Module):
         rows = inside[:, None] * jnp.stack(features, axis=-1)
         return PixelSums(table.at[triangle].add(rows, mode="promise_in_bounds", wrap_negative_indices=False), origin)
 
-    def barycentric(self, points: Array, corners: Array) -> tuple[Planes, Planes, Planes]:
+    def barycentric(self, points: Array, corners: Array) -> tuple[PlaneOf, PlaneOf, PlaneOf]:
         """Each corner's weight as a plane (constant, slope in px, slope in py) over its triangle."""
-        (ax, ay), (bx, by), (cx, cy) = ((points[corners[:, i]] - self.origin).T for i in range(3))
-        area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-        inverse = 1 / jnp.where(area == 0, jnp.ones_like(area), area)
-        return (
-            ((bx * cy - by * cx) * inverse, (by - cy) * inverse, (cx - bx) * inverse),
-            ((cx * ay - cy * ax) * inverse, (cy - ay) * inverse, (ax - cx) * inverse),
-            ((ax * by - ay * bx) * inverse, (ay - by) * inverse, (bx - ax) * inverse),
-        )
+        a, b, c = (points[corners[:, i]] - self.origin for i in range(3))
+        return barycentric_planes((a[:, 0], a[:, 1]), (b[:, 0], b[:, 1]), (c[:, 0], c[:, 1]))
 
     def squared_error(self, points: Array, z: Array, corners: Array) -> Array:
         """(T,) sum over each triangle's pixels of (z - d)^2; differentiable in the places and the heights (N,)."""

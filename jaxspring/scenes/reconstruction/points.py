@@ -16,7 +16,7 @@ Source: Huber (1964), "Robust estimation of a location parameter"; Holland & Wel
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -37,7 +37,7 @@ from .loss import MEMBRANE
 from .pixels import MIDDLE, Moments, NormalEquations
 from .posterior import LONGEST_ROW, Rows, exact_height, rows, solve_rows
 from .raster import PixelGrid, draw, locate
-from .triangles import Flip, Node, count_folds
+from .triangles import Flip, Node, refuse_folds
 
 MOST_REWEIGHTINGS = 100
 
@@ -148,7 +148,7 @@ def fit_points(
     found = fit_springs(image, settings.springs, on_iteration, progress=progress)
     mesh = found.fitted
     surface = point_heights(cloud, mesh.x, mesh.y, mesh.flip, settings.huber, settings.springs.membrane)
-    return PointSurface(**{**vars(surface), "mesh": found})
+    return replace(surface, mesh=found)
 
 
 def point_heights(
@@ -187,8 +187,7 @@ def point_heights(
     for name, value in (("huber", huber), ("membrane", membrane)):
         if value is not None:
             positive(name, value, "Without it nothing holds a node that no point reaches." if name == "membrane" else "It is a residual.")
-    if int(folds := count_folds(x, y, flip)):
-        raise ValueError(f"{int(folds)} triangles of the mesh are folded over or have no area: points would be in several. Relax it.")
+    refuse_folds(x, y, flip)
     inside, grid, start = places_of(cloud, x, y)
     low, extent = float(jnp.min(cloud.z)), float(jnp.ptp(cloud.z)) or 1.0
     delta = None if huber is None else jnp.asarray(huber / extent, x.dtype)

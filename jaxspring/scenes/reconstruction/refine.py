@@ -27,6 +27,7 @@ from ..._arrays import Numbers, on_host
 from ..._checks import has_shape, nonnegative, triangle_indices
 from ...topology.builders import from_triangles
 from ...topology.graph import Graph
+from .given import springs_along
 from .red_green import Built, sides_of
 
 DEEPEST = 20
@@ -71,7 +72,7 @@ class Subdivision:
         edges = np.asarray(from_triangles(corners, n_nodes).edges)
         has_shape("stiffness", k, {"one number": (), "one per side": (len(edges),)})
         nonnegative("stiffness", k, "A negative spring pushes its ends apart.")
-        sides = _places(edges, sides_of(corners), n_nodes)
+        sides = springs_along(edges, sides_of(corners), n_nodes)
         count = np.bincount(sides.ravel(), minlength=len(edges))
         return Subdivision(corners, n_nodes, (np.broadcast_to(k, len(edges)) / count)[sides])
 
@@ -184,11 +185,6 @@ class Subdivision:
     @cached_property
     def _leaves(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         return self._built.leaves()
-
-
-def _places(edges: np.ndarray, sides: np.ndarray, n_nodes: int) -> np.ndarray:
-    """(T, 3) which spring runs along each side; springs are sorted, lower node first."""
-    return np.searchsorted(edges.astype(np.int64) @ [n_nodes, 1], np.sort(sides, axis=-1).astype(np.int64) @ [n_nodes, 1])
 
 
 def _marks(marked: Numbers, count: int) -> np.ndarray:

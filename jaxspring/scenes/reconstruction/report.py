@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ...linalg.cg import JaxCG
+from .given import pixel_weights, weighted_rms
 from .loss import MEMBRANE, Carried, SurfaceError, choose_diagonals
 from .pixels import Moments, best_height
 from .posterior import LONGEST_ROW, exact_height
@@ -74,7 +75,7 @@ def measure(error: SurfaceError, carried: Carried, diagonals: bool = True) -> Su
     z_sampled, z_best, sampled, best, folds, lost, unreached = _draw_both(error, carried)
     truth = _own_unit(scene, scene.image.values)
     sampled, best, z_sampled, z_best = (_own_unit(scene, a) for a in (sampled, best, z_sampled, z_best))
-    rmse = Errors(*(rms(drawn - truth, scene.image.weights) for drawn in (sampled, best)))
+    rmse = Errors(*(weighted_rms(drawn - truth, pixel_weights(scene.image)) for drawn in (sampled, best)))
     x, y, flip = (np.asarray(a) for a in (carried.x, carried.y, carried.flip))
     return Surface(x, y, flip, z_sampled, z_best, sampled, best, rmse, int(folds), int(lost), _host(unreached))
 
@@ -91,7 +92,7 @@ def uniform_errors(scene: Reconstruction) -> tuple[Errors, np.ndarray, np.ndarra
         best = rows @ (np.linalg.pinv(rows) @ truth @ np.linalg.pinv(columns).T) @ columns.T
     else:
         best = rows @ _weighted_spline(rows, columns, truth, np.asarray(weights, np.float64)) @ columns.T
-    return Errors(rms(sampled - truth, weights), rms(best - truth, weights)), sampled, best
+    return Errors(*(weighted_rms(drawn - truth, pixel_weights(scene.image)) for drawn in (sampled, best))), sampled, best
 
 
 def _weighted_spline(rows: np.ndarray, columns: np.ndarray, truth: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -136,12 +137,6 @@ def _own_unit(scene: Reconstruction, scaled: jax.Array) -> np.ndarray:
 
 def _host(mask: jax.Array | None) -> np.ndarray | None:
     return None if mask is None else np.asarray(mask)
-
-
-def rms(difference: np.ndarray, weights: jax.Array | None) -> float:
-    """Root mean square of a difference `(ny, nx)`, by the weights of the pixels."""
-    of_pixel = None if weights is None else np.asarray(weights, np.float64)
-    return float(np.sqrt(np.average(difference**2, weights=of_pixel)))
 
 
 def _hats(n_nodes: int, n_pixels: int) -> np.ndarray:

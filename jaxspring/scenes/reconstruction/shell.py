@@ -22,7 +22,8 @@ from ..._arrays import Numbers, on_host, whole_number
 from ..._checks import finite, triangle_indices
 from ...topology.builders import from_triangles
 from ...topology.graph import Graph
-from .given import host_number
+from .given import differences, factored, host_number
+from .red_green import SIDES
 from .refine import Subdivision
 
 # Searches of nearest places at each level, and triangles looked at for each point.
@@ -127,16 +128,10 @@ def fit_shell(data: Numbers, points: Numbers, triangles: Numbers, n_levels: int 
 
 def _balanced(q: np.ndarray, x: np.ndarray, mesh: Subdivision, stiffness: float) -> np.ndarray:
     """Nodes in balance between the data and the springs."""
-    from scipy.sparse import csr_array, diags_array
-    from scipy.sparse.linalg import splu
-
     matrix, _ = _surface(q, x, mesh.triangles)
-    edges = np.asarray(mesh.net.edges)
-    rows, signs = np.repeat(np.arange(len(edges)), 2), np.tile([-1.0, 1.0], len(edges))
-    difference = csr_array((signs, (rows, edges.ravel())), shape=(len(edges), len(x)))
+    difference = differences(np.asarray(mesh.net.edges), len(x))
     system = matrix.T @ matrix + stiffness * (difference.T @ difference)
-    hair = diags_array(np.full(len(x), 1e-12 * system.diagonal().max()))
-    return x + splu((system + hair).tocsc()).solve(matrix.T @ (q - matrix @ x))
+    return x + factored(system, 1e-12).solve(matrix.T @ (q - matrix @ x))
 
 
 def _surface(q: np.ndarray, x: np.ndarray, triangles: np.ndarray) -> tuple[Any, np.ndarray]:
@@ -167,7 +162,7 @@ def nearest_weights(q: np.ndarray, corners: np.ndarray) -> np.ndarray:
     inside = np.stack([1 - s - t, s, t], axis=-1)
     # Outside it is on one of the sides.
     sides = []
-    for i, j in ((0, 1), (1, 2), (2, 0)):
+    for i, j in SIDES:
         one, other = corners[..., i, :], corners[..., j, :]
         along = other - one
         length = np.sum(along * along, axis=-1)

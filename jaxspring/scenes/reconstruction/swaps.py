@@ -12,7 +12,7 @@ import numpy as np
 
 from ...images.image import Image
 from ...topology.mesh_checks import Sides
-from .given import pixel_weights
+from .given import cross, pixel_weights
 from .tin import Tin, fitted_tin, locate_pixels
 
 # A triangle thinner than this share of its longest side squared is not made.
@@ -83,8 +83,8 @@ def _swept(image: Image, truth: np.ndarray, weights: np.ndarray, tin: Tin) -> np
     for _, t, u, a, b, c, d in sorted(found, reverse=True):
         if used[t] or used[u]:
             continue
-        turn = _cross(points[a] - points[c], points[d] - points[c]) > 0
-        is_up = _cross(*(points[triangles[t][i]] - points[triangles[t][0]] for i in (1, 2))) > 0
+        turn = cross(points[a] - points[c], points[d] - points[c]) > 0
+        is_up = cross(*(points[triangles[t][i]] - points[triangles[t][0]] for i in (1, 2))) > 0
         triangles[t] = (c, a, d) if turn == is_up else (c, d, a)
         triangles[u] = (c, d, b) if turn == is_up else (c, b, d)
         used[[t, u]], changed = True, True
@@ -94,12 +94,12 @@ def _swept(image: Image, truth: np.ndarray, weights: np.ndarray, tin: Tin) -> np
 def _error(quad: np.ndarray, place: np.ndarray, data: np.ndarray) -> float:
     """Squared error beside values and weights `data` (P, 2) of the surface cut from corner 0 to corner 1, corners 2 and 3 beside it."""
     a, b = quad[0], quad[1]
-    beside = _cross(b[:2] - a[:2], place - a[:2]) * _cross(b[:2] - a[:2], quad[2][:2] - a[:2]) >= 0
+    beside = cross(b[:2] - a[:2], place - a[:2]) * cross(b[:2] - a[:2], quad[2][:2] - a[:2]) >= 0
     total = 0.0
     for corner, held in ((quad[2], beside), (quad[3], ~beside)):
         u, v, p = b - a, corner - a, place[held] - a[:2]
-        area = _cross(u, v)
-        s, t = _cross(p, v) / area, _cross(u, p) / area
+        area = cross(u, v)
+        s, t = cross(p, v) / area, cross(u, p) / area
         total += float(np.sum(data[held, 1] * (a[2] + s * u[2] + t * v[2] - data[held, 0]) ** 2))
     return total
 
@@ -108,13 +108,9 @@ def _is_convex(quad: np.ndarray) -> bool:
     """Whether the side from corner 2 to corner 3 runs inside, and cuts off no sliver."""
     a, b, c, d = quad
     along = d - c
-    left, right = float(_cross(along, a - c)), float(_cross(along, b - c))
+    left, right = float(cross(along, a - c)), float(cross(along, b - c))
     longest = max(float(np.sum((p[:2] - q[:2]) ** 2)) for p in (a, b) for q in (c, d))
     return bool(left * right < 0) and min(abs(left), abs(right)) > THIN * max(longest, float(np.sum(along[:2] ** 2)))
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
 __all__ = ["swap_sides"]

@@ -20,7 +20,7 @@ from ..._checks import finite, triangle_indices
 from ...images.image import Image
 from ...topology.builders import from_triangles
 from ...topology.graph import Graph
-from .given import pixel_weights, plane_points, weighted_rms
+from .given import cross, differences, factored, pixel_weights, plane_points, weighted_rms
 
 # Within so much of its edges a pixel counts as inside a triangle, in barycentric coordinates.
 EDGE = 1e-9
@@ -58,7 +58,7 @@ def locate_pixels(image: Image, points: np.ndarray, triangles: np.ndarray) -> Lo
     high = np.minimum(np.floor(corners.max(axis=0) + EDGE), [nx - 1, ny - 1]).astype(np.int64)
     size = np.maximum(high - low + 1, 0)
     count = size[:, 0] * size[:, 1]
-    area = _cross(b - a, c - a)
+    area = cross(b - a, c - a)
     count[area == 0] = 0
     found, weights, depth = np.full(ny * nx, -1), np.zeros((ny * nx, 3)), np.full(ny * nx, -np.inf)
     start = 0
@@ -68,8 +68,8 @@ def locate_pixels(image: Image, points: np.ndarray, triangles: np.ndarray) -> Lo
         place = np.arange(len(each)) - np.repeat(np.cumsum(count[start:stop]) - count[start:stop], count[start:stop])
         column, row = low[each, 0] + place % np.maximum(size[each, 0], 1), low[each, 1] + place // np.maximum(size[each, 0], 1)
         p = np.stack([column, row], axis=-1)
-        u = _cross(b[each] - p, c[each] - p) / area[each]
-        v = _cross(c[each] - p, a[each] - p) / area[each]
+        u = cross(b[each] - p, c[each] - p) / area[each]
+        v = cross(c[each] - p, a[each] - p) / area[each]
         w = np.stack([u, v, 1 - u - v], axis=-1)
         least = w.min(axis=1)
         pixel = row * nx + column
@@ -94,21 +94,17 @@ def fitted_heights(
     matrix: Any, data: np.ndarray, net: Graph, weights: np.ndarray, whole: np.ndarray | None = None, membrane: float = MEMBRANE
 ) -> np.ndarray:
     """(N,) heights nearest to the pixels `data` (P,) by their `weights` (P,), with a little membrane along the springs that are whole."""
-    from scipy.sparse import csr_array, diags_array
-    from scipy.sparse.linalg import splu
+    from scipy.sparse import diags_array
 
     n, edges = net.n_nodes, np.asarray(net.edges)
-    rows, signs = np.repeat(np.arange(len(edges)), 2), np.tile([-1.0, 1.0], len(edges))
-    difference = csr_array((signs, (rows, edges.ravel())), shape=(len(edges), n))
+    difference = differences(edges, n)
     normal = matrix.T @ diags_array(weights) @ matrix
     ratio = membrane * max(float(normal.sum()), 1.0) / n
     held = np.ones(len(edges)) if whole is None else np.where(whole, 1.0, 1e-6)
     middle = float(np.average(data, weights=weights))
     system = normal + ratio * (difference.T @ diags_array(held) @ difference)
     counts = weights * (np.asarray(matrix.sum(axis=1)).ravel() > 0)
-    hair = 1e-13 * system.diagonal().max()
-    factor = splu((system + diags_array(np.full(n, hair))).tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
-    return middle + factor.solve(matrix.T @ (counts * (data - middle)))
+    return middle + factored(system, 1e-13).solve(matrix.T @ (counts * (data - middle)))
 
 
 @dataclass(frozen=True)
@@ -200,15 +196,11 @@ def fitted_tin(image: Image, points: Numbers, triangles: Numbers) -> Tin:
 
 def _areas_and_angle(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, float]:
     a, b, c = (points[triangles[:, i]] for i in range(3))
-    twice = _cross(b - a, c - a)
+    twice = cross(b - a, c - a)
     sides = np.sort(np.stack([np.linalg.norm(q - p, axis=1) for p, q in ((a, b), (b, c), (c, a))]), axis=0)
     longest = sides[1] * sides[2]
     sine = np.clip(np.abs(twice) / np.where(longest > 0, longest, 1), 0, 1)
     return twice, float(np.degrees(np.arcsin(sine.min())))
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
 __all__ = ["Located", "SurfaceErrors", "Tin", "fitted_heights", "fitted_tin", "locate_pixels", "surface_matrix"]

@@ -51,6 +51,18 @@ def count_folds(x: Node, y: Node, flip: Flip) -> Int[Array, ""]:
     return jnp.sum(doubled_areas(x, y, flip) <= 0).astype(jnp.int32)
 
 
+def triangle_corners(flip: np.ndarray) -> np.ndarray:
+    """(T, 3) node numbers of every triangle of a lattice whose cells are cut along `flip`."""
+    ny, nx = (n + 1 for n in flip.shape)
+    return np.stack([np.ravel(corner) for corner in corners(jnp.arange(ny * nx).reshape(ny, nx), jnp.asarray(flip))], axis=-1)
+
+
+def refuse_folds(x: Node, y: Node, flip: Flip) -> None:
+    """Raise ValueError where triangles of a user's mesh are folded over or have no area."""
+    if folds := int(count_folds(x, y, flip)):
+        raise ValueError(f"{folds} triangles of the mesh are folded over or have no area: points would be in several. Relax it.")
+
+
 def neighbours(flip: Flip) -> Int[Array, "3 T"]:
     """Triangle across the edge opposite to each corner (a, b, c), and OUTSIDE (-1) across the border."""
     my, mx = flip.shape

@@ -119,3 +119,13 @@ def test_a_lens_that_cannot_be_is_refused(arguments, match):
     """By the name of what is wrong."""
     with pytest.raises(ValueError, match=match):
         js.lens.Lens(**arguments)
+
+
+def test_images_with_holes_are_refused():
+    """What lies under a hole would be shown as data elsewhere."""
+    holed = js.Image(jnp.ones((97, 97)), weights=jnp.ones((97, 97)).at[3, 4].set(0))
+    warp, _ = pair(jnp.array([30.0, 30.0]), jnp.array([70.0, 70.0]), jnp.array([1.5, 1.5]))
+    for refused in (warp.apply, warp.undo, lambda image: js.lens.Importance(image, 2.0)):
+        with pytest.raises(ValueError, match=r"image has weights or holes.*image\.filled\(\)"):
+            refused(holed)
+    assert warp.apply(holed.filled()).shape == (97, 97)

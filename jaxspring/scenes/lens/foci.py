@@ -21,7 +21,7 @@ from jaxtyping import Array
 
 from ..._arrays import Numbers
 from ..._checks import as_inexact, constant, finite, has_shape, is_concrete, kind
-from ...images.image import Image
+from ...images.image import Image, without_holes
 
 # x0, y0, x1, y1 of a rectangle [pixels].
 Extent = tuple[Array, Array, Array, Array]
@@ -168,7 +168,7 @@ class Importance(Focus):
         image, magnification: as above.
 
     Raises:
-        ValueError: pixels outside 0 to 1, a magnification that is not positive.
+        ValueError: pixels outside 0 to 1, an image with weights, a magnification that is not positive.
         TypeError: not a `js.Image`.
 
     >>> import numpy as np
@@ -180,7 +180,8 @@ class Importance(Focus):
     magnification: Array
 
     def __init__(self, image: Image, magnification: Array | float):
-        self.image = kind("image", image, Image, "js.Image(mask.astype(float))")
+        image = kind("image", image, Image, "js.Image(mask.astype(float))")
+        self.image = without_holes("image", image, "importance must be known everywhere.")
         if is_concrete(image.values):
             low, high = float(jnp.min(image.values)), float(jnp.max(image.values))
             if low < 0 or high > 1:

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ...forces.springs import Springs
-from ...images.image import Image
+from ...images.image import Image, without_holes
 from ...images.sampling import Sampling
 from ...images.surface import Surface
 from ...status import Status
@@ -101,7 +101,7 @@ class Warp(eqx.Module):
             image: a `js.Image`, or pixels (..., ny, nx) of one image or several.
 
         Raises:
-            ValueError: an image of another shape.
+            ValueError: an image of another shape, or with weights.
         """
         return self._sampled(image, *self._inverse_of_pixels())
 
@@ -200,6 +200,7 @@ class Warp(eqx.Module):
         """The image read at (x, y) of every pixel."""
         if isinstance(image, Image):
             self._check_shape(image.shape)
+            image = without_holes("image", image, "what a lens shows lies elsewhere than its weights.")
             return image.with_values(self._read(image.values, x, y))
         self._check_shape(image.shape[-2:])
         stack = image.reshape(-1, *self.shape)

@@ -17,8 +17,9 @@ import numpy as np
 
 from ._arrays import Numbers
 from ._checks import as_inexact, finite, has_shape, is_concrete, shape_of
+from .closures import opened
 from .images.image import Image
-from .system import System
+from .system import System, as_system
 from .topology.base import Topology
 from .topology.edge_field import EdgeField, SpringNumbers
 
@@ -52,13 +53,14 @@ def replace(system: System, *, mass: Numbers | None = None, effect: int | None =
     >>> print(replace(system, stiffness=2.0, mass=3.0).forces[0].stiffness)
     2.0
     """
+    system = as_system(system)
     parts = list(system.parts)
     changes: dict[int, dict[Path, Any]] = {}
     for name, value in constants.items():
         i, path = _find(system, name, effect)
         changes.setdefault(i, {})[path] = value
     for i, new in changes.items():
-        parts[i] = _with(parts[i], new)
+        parts[i] = opened(_with(parts[i], new), _called(system, i))
     n = len(system.forces)
     new_mass = system.mass if mass is None else System(system.net, mass).mass
     rules = None if system.rules is None else tuple(parts[n:])

@@ -70,7 +70,7 @@ def _facts(value: Any, path: str, is_fixed: bool, depth: int, seen: set[int]) ->
 def _parts(value: Any) -> Iterator[tuple[str, Any, bool]]:
     """Fields of an object, and whether each is fixed when a program is compiled."""
     if not dataclasses.is_dataclass(value):
-        yield from ((name, part, True) for name, part in sorted(_attributes(value).items()))
+        yield from ((name, part, True) for name, part in sorted(attributes(value).items()))
         return
     # An object that JAX does not know is a leaf, and as a whole fixed.
     is_tree = not any(leaf is value for leaf in jax.tree.leaves(value))
@@ -86,7 +86,7 @@ def _of_array(value: Any, is_fixed: bool) -> str:
     return f"{kind} {hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()[:16]}"
 
 
-def _attributes(value: Any) -> dict[str, Any]:
+def attributes(value: Any) -> dict[str, Any]:
     """What an object holds, by name, in `__dict__` or in slots."""
     slots = (name for kind in type(value).__mro__ for name in np.atleast_1d(getattr(kind, "__slots__", ())).tolist())
     held = {name: getattr(value, name) for name in slots if name not in ("__dict__", "__weakref__") and hasattr(value, name)}
@@ -97,21 +97,25 @@ def _of_function(function: Any, path: str, depth: int, seen: set[int]) -> Iterat
     """Its name, its code and what it holds: what it closes over, what it reads from its module, or its fields as an object."""
     name = getattr(function, "__qualname__", _name(type(function)))
     yield path, f"{name} {_of_code(function.__code__)}" if isinstance(function, types.FunctionType) else name
-    if isinstance(function, functools.partial):
-        inner: Any = (function.func, function.args, function.keywords)
-    elif isinstance(function, types.MethodType):
-        inner = (function.__func__, function.__self__)
-    elif isinstance(function, types.FunctionType):
+    if isinstance(function, types.FunctionType):
         if id(function) in seen:  # told already, or calling itself
             return
         seen.add(id(function))
-        closed = tuple(_content(cell) for cell in function.__closure__ or ())
-        inner = (function.__defaults__, function.__kwdefaults__, closed, _read_from_module(function))
-    elif isinstance(function, types.BuiltinFunctionType):
-        inner = None
-    else:
-        inner = (_attributes(function), vars(type(function)).get("__call__"))
-    yield from _facts(inner, f"{path}()", True, depth - 1, seen)
+    yield from _facts(held_by(function), f"{path}()", True, depth - 1, seen)
+
+
+def held_by(function: Any) -> Any:
+    """What a function holds besides its code."""
+    if isinstance(function, functools.partial):
+        return function.func, function.args, function.keywords
+    if isinstance(function, types.MethodType):
+        return function.__func__, function.__self__
+    if isinstance(function, types.FunctionType):
+        closed = tuple(content(cell) for cell in function.__closure__ or ())
+        return function.__defaults__, function.__kwdefaults__, closed, _read_from_module(function)
+    if isinstance(function, types.BuiltinFunctionType):
+        return None
+    return attributes(function), vars(type(function)).get("__call__")
 
 
 def _read_from_module(function: types.FunctionType) -> dict[str, Any]:
@@ -130,10 +134,11 @@ def _of_code(code: types.CodeType) -> str:
     return hashlib.sha256(repr((code.co_code, code.co_names, constants)).encode()).hexdigest()[:16]
 
 
-def _content(cell: Any) -> Any:
+def content(cell: types.CellType) -> Any:
+    """What a cell of a closure holds; None before it is filled."""
     try:
         return cell.cell_contents
-    except ValueError:  # not filled yet
+    except ValueError:
         return None
 
 

@@ -21,6 +21,7 @@ from . import printing
 from ._arrays import Numbers, as_mask
 from ._checks import as_inexact, has_shape, positive, shape_of
 from .bound import BoundSystem, Energy
+from .closures import opened
 from .forces.base import Force, Rule, Scene, check_class
 from .forces.linearisation import Linearisation
 from .linalg.operators import Blocks
@@ -81,7 +82,7 @@ class System(Nodes):
         # None, not an empty tuple, which some transformations of equinox and diffrax mistake for an array.
         self.rules = tuple(self._adopt_rule(i, r) for i, r in enumerate(rules if isinstance(rules, Iterable) else (rules,))) or None
         self.free = _as_free(net, free)
-        self.motion = motion
+        self.motion = opened(motion, "motion")
         if motion is not None:
             moved = as_mask("motion.moved", motion.moved, ", True where a node follows the schedule")
             has_shape("motion.moved", moved, {"one per node": (net.n_nodes,), "node shape": net.node_shape})
@@ -137,6 +138,7 @@ class System(Nodes):
         if other is not None and (other.node_shape != self.net.node_shape or other.node_permutation != self.net.node_permutation):
             raise ValueError(f"{name} ({type(effect).__name__}) was built on another topology than the system.")
         check_class(effect)
+        effect = opened(effect, f"{name} ({type(effect).__name__})")
         if any(_is_shared(leaf) for leaf in jax.tree.leaves(effect)):
             effect = jax.tree.map(_own_copy, effect)
         if other is not None and not same_box(box_of(other), box_of(self.net)):

@@ -2,11 +2,13 @@
 
 The distance cannot fall faster than the node and the obstacle approach each other, V: from a distance d nothing is met for the time d / V.
 The search goes by such times, or by a 64th of what is left where they are shorter. Where the distance falls at one end of an interval
-and rises at the other, it is looked at between them too, where the two tangents cross: near the lowest point. The first interval in
-which it becomes negative holds the root, which Newton's method finds, kept between bounds.
+and rises at the other, it is looked at between them too, where the two tangents cross, and again in the part that still falls and rises:
+along a straight way the distance to a convex obstacle lies above its tangents, so that this ends at the lowest point, or where the
+tangents cross above zero. The first interval in which the distance becomes negative holds the root, which Newton's method finds, kept
+between bounds.
 
-Source: marching by distances as in Hart (1996), "Sphere tracing"; Newton's method with bisection as in Press and others, Numerical
-Recipes (2007), 9.4.
+Source: marching by distances as in Hart (1996), "Sphere tracing"; tangents as in Kelley (1960), "The cutting-plane method"; Newton's method
+with bisection as in Press and others, Numerical Recipes (2007), 9.4.
 """
 
 from __future__ import annotations
@@ -21,15 +23,22 @@ from jaxtyping import Array
 from ..numerics import tiny
 
 SHORTEST = 64  # intervals in what is left of a step, at most
+NARROWINGS = 24  # looks at a dip, at most
 ITERATIONS = 60  # of Newton's method: a bisection alone would need as many as a number has digits
 
 
 class _March(NamedTuple):
-    """Where the search stands: time, distance there and its slope, the interval of the root, whether it is found, whether it goes on."""
+    """Where the search stands: time, distance there and its slope; the end of a dip that is looked into, distance and slope there, and how
+    often it was looked at, 0 where there is none; the interval of the root, whether it is found, whether the search goes on.
+    """
 
     s: Array
     value: Array
     slope: Array
+    beyond: Array
+    value_beyond: Array
+    slope_beyond: Array
+    looks: Array
     low: Array
     high: Array
     is_found: Array
@@ -52,22 +61,44 @@ def first_root(
     least, speed = end / SHORTEST, jnp.maximum(speed, tiny(speed.dtype))
     value, slope = distance(begin)
     is_passed = is_wanted & (value < -rounding)
-    start = _March(begin, value, slope, jnp.zeros_like(begin), begin, is_passed, is_wanted & ~is_passed & (begin < end))
+    never = jnp.zeros(jnp.shape(begin), jnp.int32)
+    start = _March(
+        begin, value, slope, begin, value, slope, never, jnp.zeros_like(begin), begin, is_passed, is_wanted & ~is_passed & (begin < end)
+    )
 
     def further(at: _March) -> _March:
-        s = jnp.minimum(at.s + jnp.maximum(at.value / speed, least), end)
+        within = at.looks > 0
+        ahead = jnp.minimum(at.s + jnp.maximum(at.value / speed, least), end)
+        s = jnp.where(within, _crossing(at, at.beyond, at.value_beyond, at.slope_beyond)[0], ahead)
         value, slope = distance(s)
-        turns = (at.slope < 0) & (slope > 0)
-        steps = jnp.where(turns, at.slope - slope, -jnp.ones_like(slope))
-        lowest = jnp.where(turns, jnp.clip(at.s + (value - at.value - slope * (s - at.s)) / steps, at.s, s), s)
-        dips = distance(lowest)[0] < -rounding
-        is_in = at.is_open & (dips | (value < -rounding))
-        high = jnp.where(dips, lowest, s)
-        low, high = (jnp.where(is_in, new, old) for new, old in ((at.s, at.low), (high, at.high)))
-        return _March(s, value, slope, low, high, at.is_found | is_in, at.is_open & ~is_in & (s < end))
+        is_in = at.is_open & (value < -rounding)
+        # The part that falls at its begin and rises at its end.
+        falls = slope <= 0
+        old = at.beyond, at.value_beyond, at.slope_beyond
+        right = tuple(jnp.where(within & falls, a, b) for a, b in zip(old, (s, value, slope), strict=True))
+        left = tuple(jnp.where(within & falls, b, a) for a, b in zip((at.s, at.value, at.slope), (s, value, slope), strict=True))
+        part = at._replace(s=left[0], value=left[1], slope=left[2])
+        lowest, bottom = _crossing(part, *right)
+        dips = (left[2] < 0) & (right[2] > 0) & (left[0] < lowest) & (lowest < right[0])
+        looks_on = at.is_open & ~is_in & dips & ((at.looks == 0) | (bottom < -rounding)) & (at.looks < NARROWINGS)
+        low, high = (jnp.where(is_in, new, old) for new, old in ((at.s, at.low), (s, at.high)))
+        at_begin = tuple(jnp.where(looks_on, a, b) for a, b in zip(left, right, strict=True))
+        ended = ~looks_on & ~(at_begin[0] < end)  # NaN ends it
+        looks = jnp.where(looks_on, at.looks + 1, 0)
+        (s, value, slope), (far, value_far, slope_far) = at_begin, right
+        is_found, is_open = at.is_found | is_in, at.is_open & ~is_in & ~ended
+        return _March(s, value, slope, far, value_far, slope_far, looks, low, high, is_found, is_open)
 
     found = lax.while_loop(lambda at: jnp.any(at.is_open), further, start)
     return _polished(distance, found), found.is_found
+
+
+def _crossing(at: _March, s: Array, value: Array, slope: Array) -> tuple[Array, Array]:
+    """Where the tangents at the ends of an interval cross [s], and how high [m]; at its end where they do not cross within."""
+    turns = (at.slope < 0) & (slope > 0)
+    steps = jnp.where(turns, at.slope - slope, -jnp.ones_like(slope))
+    lowest = jnp.where(turns, jnp.clip(at.s + (value - at.value - slope * (s - at.s)) / steps, at.s, s), s)
+    return lowest, value + slope * (lowest - s)
 
 
 def _polished(distance: Callable[[Array], tuple[Array, Array]], found: _March) -> Array:

@@ -104,10 +104,13 @@ def without(v: Vector, basis: tuple[Vector, ...]) -> Vector:
 
 
 def braked(pull: Array, along: Vector) -> Array:
-    """Which part of a tangential velocity friction takes that could take `pull` of it [m/s]; 0 where there is none."""
+    """Which part of a tangential velocity friction takes that could take `pull` of it [m/s]. What does not slide it holds: were that
+    none, a node at rest would have the derivative of one that nothing holds.
+    """
     speed = along.norm()
     is_sliding, one = speed > 0, jnp.ones_like(speed)
-    return jnp.where(is_sliding, jnp.minimum(pull / jnp.where(is_sliding, speed, one), one), jnp.zeros_like(speed))
+    share = jnp.minimum(pull / jnp.where(is_sliding, speed, one), one)
+    return jnp.where(is_sliding, share, jnp.where(pull > 0, one, jnp.zeros_like(speed)))
 
 
 def halted(pull: Array, along: Vector, begun: Vector) -> Array:

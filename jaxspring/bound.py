@@ -135,6 +135,14 @@ class BoundSystem(Nodes):
             state = part.keep(state, part.remember(state))
         return state
 
+    def commanded_as(self, before: State, state: State, is_same: Array) -> State:
+        """The state with the commands that an earlier one holds, where `is_same`."""
+        for i, part in self.followers:
+            entry, new = entry_at(before.memory, i), entry_at(state.memory, i)
+            if part.drives and entry is not None and new is not None and jnp.shape(entry.value) == jnp.shape(new.value):
+                state = part.keep(state, jnp.where(is_same, entry.value, new.value))
+        return state
+
     def follow(self, before: State, state: State, dt: Array, pushed: Vector | None = None) -> tuple[State, Status]:
         """What happens after a step besides motion, and what went wrong there.
 

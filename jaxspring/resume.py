@@ -111,8 +111,11 @@ def check_kind(resume: Any) -> None:
         )
 
 
-def taken_up(resume: Resume, system: System, ready: BoundSystem, state: State, start: State, stepper: Stepper, dt: Array) -> Resume:
-    """The resume as it fits this run: memory and time as they were, or anew.
+def taken_up(
+    resume: Resume, system: System, ready: BoundSystem, state: State, start: State, stepper: Stepper, dt: Array
+) -> tuple[Resume, State]:
+    """The resume as it fits this run, memory and time as they were, or anew; and the start, with the commands that were in force where
+    nothing changed: they may have been rounded otherwise.
 
     Args:
         resume: of the earlier run.
@@ -130,17 +133,19 @@ def taken_up(resume: Resume, system: System, ready: BoundSystem, state: State, s
     same_dt = still_dt == resume.dt
     goes_on = same_dt & (still_time == resume.time)
     is_same = same_dt & (constants == resume.constants) & (checksum(state) == resume.state)
-    return Resume(
+    is_same = is_same & jnp.asarray(resume.origin.rest == origin.rest)
+    taken = Resume(
         start_time=jnp.where(goes_on, resume.start_time, state.time),
         start_step=jnp.where(goes_on, resume.start_step, resume.step),
         step=resume.step,
         time=state.time,
         dt=dt,
-        memory=_memory(resume, is_same & jnp.asarray(resume.origin.rest == origin.rest), stepper, ready, start),
+        memory=_memory(resume, is_same, stepper, ready, start),
         constants=constants,
         state=resume.state,
         origin=origin,
     )
+    return taken, ready.commanded_as(state, start, is_same)
 
 
 def numbers(tree: Any) -> Any:

@@ -212,7 +212,7 @@ def _begin(system: System, ready: BoundSystem, state: State, resume: Resume | No
     if resume is None:
         taken = _fresh(system, ready, state, start, job)
     else:
-        taken = taken_up(resume, system, ready, state, start, job.stepper, job.dt)
+        taken, start = taken_up(resume, system, ready, state, start, job.stepper, job.dt)
     precise = Precision.of(ready, start)
     status = begin(system, ready, precise, Carry(start, taken.memory, taken.step), job.dt, limit)
     if not job.stepper.runs_backward:

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._arrays import Numbers, as_indices
+from .._arrays import Numbers, as_indices, own
 from .._checks import as_inexact, has_shape, is_concrete, positive
 from ..state import State
 from ..topology.base import Topology
@@ -101,7 +101,7 @@ class Actuation(eqx.Module):
         Raises:
             ValueError: an answer of another shape.
         """
-        found = jnp.asarray(self.controller(state), state.dtype)
+        found = own("what the controller gives", self.controller(state), state.dtype)
         many = {"one per spring": (net.n_springs,)} if self.groups is None else {"one per group": (self.n_groups or 0,)}
         has_shape("what the controller gives", found, {"one number": (), **many})
         return jnp.clip(found, self.low.astype(state.dtype), self.high.astype(state.dtype))

@@ -164,6 +164,10 @@ class Springs(Force):
         """The command in force, as its controller gives it; None where nobody drives them."""
         return None if self.actuation is None else self.actuation.command(self.net, state)
 
+    def renew(self, memory: Any, state: State) -> Any:
+        """The command of the controller that drives them now, whoever drove them in an earlier run."""
+        return self.remember(state)
+
     def update(self, step: Step, state: State) -> tuple[State, Status]:
         """The state with the command of the next step."""
         return (state if self.actuation is None else self.keep(state, self.remember(state))), Status.ok()

@@ -24,6 +24,15 @@ STEPPERS = [
 ]
 
 
+class Fixed(eqx.Module):
+    """A command from outside."""
+
+    command: jax.Array
+
+    def __call__(self, state):
+        return self.command
+
+
 @pytest.fixture(autouse=True)
 def sooner():
     """Programs that run once need no optimisation."""
@@ -108,6 +117,24 @@ def test_bad_input_is_named():
         eqx.tree_at(lambda s: s.forces[0].actuation.low, driven(), jnp.asarray(2.0)), start(), js.SymplecticEuler(), 0.01, 1
     )
     assert bool(traced.status.has(js.Flag.INVALID))
+
+
+def test_a_new_controller_acts_at_once():
+    """A run that goes on from a state asks the controller that it is given, as in a loop of one step a call; with `resume`, too, where it
+    is another: v = dt k (c - 1) / m = 0.2, and its derivative by c.
+    """
+    net = js.lattice(2)
+
+    def gone(state, action, resume=None):
+        springs = js.Springs(net, 100.0, 1.0, actuation=js.robot.Actuation(Fixed(action)))
+        system = js.System(net, 1.0, springs, free=np.array([False, True]))
+        return js.rollout(system, state, js.SymplecticEuler(), 0.01, 1, resume=resume)
+
+    first = gone(js.State.from_points(net, net.grid()), jnp.asarray(1.0))
+    for resume in (None, first.resume):
+        value, slope = jax.value_and_grad(lambda c, resume=resume: gone(first.state, c, resume).state.velocity.x[1])(jnp.asarray(1.2))
+        assert float(value) == pytest.approx(0.2, rel=1e-12)
+        assert float(slope) == pytest.approx(1.0, rel=1e-12)
 
 
 @pytest.mark.slow

@@ -16,8 +16,8 @@ two unknowns each, by the energies in `moduli.py`. On equilateral triangles with
     e1 = 8/9 C22,  e0 = C11 - C22 / 9           C12 = C33 = C22 / 3;  for C11 = C22 isotropic, nu = 1/3, k = sqrt(3)/2 C11 (1 - nu^2)
     b0 = B2,  b1 = (9 B1 - B2) / 8              Poisson's ratio -1/3;  a hinge along warp bends weft alone, the others bend both ways
 
-All four are kept above a twentieth of what was asked along them. No springs give C12 another value than C33. What comes out, and what was
-asked, is in `Cloth`.
+and with rows across warp the same with warp and weft exchanged. No side has less than a twentieth of the smaller modulus.
+No springs give C12 another value than C33. What comes out, and what was asked, is in `Cloth`.
 
 Source: Cauchy's relations for central forces; Van Gelder (1998), "Approximate simulation of elastic membranes by triangulated spring
 meshes", for S / l^2; the rest from the energies in `moduli.py`.
@@ -180,12 +180,14 @@ def _on_triangles(net: Topology, places: np.ndarray, f: Fabric) -> Cloth:
     own = _own_area(net, places, triangles)
     sides = places[net.edges[:, 1]] - places[net.edges[:, 0]]
     per_modulus = _area_at(net, triangles, np.abs(twice_areas(places, triangles)) / 2) / np.einsum("ed,ed->e", sides, sides)
-    stiffness = _fitted(f.stretch, per_modulus, _near_warp(sides), stretches(places, net.edges, float(own.sum())))
+    rows = stretches(places, net.edges, float(own.sum()))
+    stiffness = _fitted(f.stretch, per_modulus, _near_warp(sides), rows)
     nodes = hinges_of(triangles)
     edges = places[nodes[:, 1]] - places[nodes[:, 0]]
     both = np.abs(twice_areas(places, nodes[:, [0, 1, 2]])) + np.abs(twice_areas(places, nodes[:, [0, 1, 3]]))
     rows = turns(places, nodes, triangles)
-    bend = Hinges(net, _fitted(f.bending, 2 * np.einsum("hd,hd->h", edges, edges) / both, _near_warp(edges), rows), triangles=triangles)
+    per_modulus = 2 * np.einsum("hd,hd->h", edges, edges) / both
+    bend = Hinges(net, _fitted(f.bending, per_modulus, _near_warp(edges), rows), triangles=triangles)
     return _cloth(net, places, f, stiffness, bend, matrix(bend.stiffness, rows), own)
 
 
@@ -196,7 +198,9 @@ def _fitted(asked: Array, per_modulus: np.ndarray, near_warp: np.ndarray, rows: 
     if np.linalg.cond(gives) > ILL_POSED:
         raise ValueError("all sides of the triangles lie at one angle to warp, so that warp and weft cannot differ. Turn the pattern.")
     found = jnp.matmul(jnp.asarray(np.linalg.inv(gives), asked.dtype), asked)
-    return jnp.matmul(jnp.maximum(found, LEAST * asked), jnp.asarray(shares, asked.dtype))
+    each = jnp.asarray(shares, asked.dtype)
+    # Of the sides that there are: with rows across warp no side has e0 itself, which may then be negative.
+    return jnp.maximum(jnp.matmul(found, each), LEAST * jnp.min(asked) * jnp.sum(each, axis=0))
 
 
 def _cloth(net: Topology, places: np.ndarray, f: Fabric, stiffness: Array, bend: Force, realised: Array, own: np.ndarray) -> Cloth:
@@ -247,7 +251,9 @@ def _flat(net: Topology, points: Numbers) -> np.ndarray:
             f"points[{i}] has z = {places[i, 2]:.6g} and points[0] {places[0, 2]:.6g}: a fabric is cut flat, where warp and weft have a "
             f"direction. Pass the flat pattern here, and the shape in space to the State."
         )
-    return places[:, :2]
+    # About its middle: areas are differences of products, which lose digits far from the origin.
+    flat = places[:, :2].astype(np.float64)
+    return flat - 0.5 * (flat.min(axis=0) + flat.max(axis=0))
 
 
 def _spacing(net: Lattice, places: np.ndarray) -> float:

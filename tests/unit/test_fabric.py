@@ -167,6 +167,26 @@ def test_an_isotropic_fabric_is_isotropic_on_equilateral_triangles():
         np.testing.assert_allclose(v @ np.asarray(d) @ v, expected, rtol=1e-12)
 
 
+def test_a_fabric_does_not_depend_on_where_its_pattern_lies():
+    """Areas and angles a thousand kilometres away, in double precision: to the rounding of the places themselves."""
+    net, points = js.cloth.rectangle(0.3, 0.3 * np.sqrt(3) / 2, 0.03)
+    here, away = (js.cloth.fabric(net, points + np.array([off, off, 0.0]), ISOTROPIC_KNIT) for off in (0.0, 1e6))
+    np.testing.assert_allclose(away.bending.stiffness, here.bending.stiffness, rtol=1e-6)
+    np.testing.assert_allclose(away.springs.stiffness, here.springs.stiffness, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("warp", "weft"), [(1.0, 8.5), (40.0, 1.0)])
+def test_triangles_bend_as_asked_along_warp_and_weft(warp, weft):
+    """With rows along warp as far as the table says; with rows across warp the same turned."""
+    net, points = js.cloth.rectangle(0.3, 0.3 * np.sqrt(3) / 2, 0.03)
+    for places, asked in ((points, (warp, weft)), (points[:, [1, 0, 2]], (weft, warp))):
+        cloth = js.cloth.fabric(net, places, js.cloth.Fabric(0.2, 100.0, 33.0, 1e-5 * np.array(asked)))
+        np.testing.assert_allclose(np.diag(cloth.realised.bending)[:2], 1e-5 * np.array(asked), rtol=1e-9)
+
+
+ISOTROPIC_KNIT = js.cloth.Fabric(0.2, 100.0, 33.0, 5e-5)
+
+
 def test_hinges_of_a_square_grid_are_not_isotropic():
     """With one diagonal: 1 along the axes, 3 along the diagonal, 1 across, least .75 at 15 degrees; twist 6, turned by 45 degrees 2."""
     net = js.lattice((12, 12))

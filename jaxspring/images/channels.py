@@ -45,8 +45,10 @@ class Luminance(eqx.Module):
         """From `(ny, nx, n_channels)` to `(ny, nx)`, in the range of the channels."""
         if pixels.shape[-1] < 3:
             return pixels[..., 0]
-        dtype = pixels.dtype if pixels.dtype.kind == "f" else np.float64
-        return pixels[..., :3] @ np.array([0.299, 0.587, 0.114], dtype)
+        dtype = pixels.dtype if pixels.dtype.kind == "f" else np.dtype(np.float64)
+        red, green, blue = np.moveaxis(pixels[..., :3].astype(dtype), -1, 0)
+        # From red on: where all three are one number, that very number.
+        return red + dtype.type(0.587) * (green - red) + dtype.type(0.114) * (blue - red)
 
 
 class TerrainRGB(eqx.Module):
@@ -108,6 +110,12 @@ class Pixels:
     alpha: int | None = None
     is_premultiplied: bool = False
     has_bands: bool = False
+
+    @staticmethod
+    def of_array(values: NDArray[Any], mask: NDArray[Any] | None = None) -> Pixels:
+        """Of an array that says nothing of itself: bytes of two or four channels have their opacity in the last, as in a file."""
+        has_opacity = values.ndim == 3 and values.shape[-1] in (2, 4) and values.dtype == np.uint8
+        return Pixels(values, mask=mask, alpha=values.shape[-1] - 1 if has_opacity else None)
 
     def one_channel(self, channel: OneChannel | None, fill: float | None) -> NDArray[Any]:
         """`(ny, nx)`, with `fill` in place and behind; unchanged where no channel was asked for and there are several.

@@ -48,7 +48,8 @@ def image_from_array(
     """An `Image` from a NumPy array `(ny, nx)`, or `(ny, nx, n_channels)` with a `channel` that says which grey to take.
 
     Args:
-        pixels: the array, of any real type.
+        pixels: the array, of any real type. Of bytes with two or four channels the last is opacity, as in a PNG: where a pixel is
+            transparent it has no value.
         channel: `Luminance()`, `Channel(index)`, `TerrainRGB()`, `Terrarium()`, or None for an array of one channel.
         spacing: distance between pixels [m], as in `Image`.
         origin: position of the first pixel [m], as in `Image`.
@@ -69,7 +70,7 @@ def image_from_array(
     if isinstance(pixels, Tracer):
         raise TypeError("pixels are traced, so that they cannot be looked at: build Image(values) inside jit and grad.")
     mask = np.ma.getmaskarray(pixels) if isinstance(pixels, np.ma.MaskedArray) else None
-    return image_of(Pixels(np.asarray(pixels), mask=mask), channel, spacing, origin, fill, holes)
+    return image_of(Pixels.of_array(np.asarray(pixels), mask), channel, spacing, origin, fill, holes)
 
 
 def image_of(
@@ -175,9 +176,9 @@ def _read_pixels(path: str, array: str | None, page: int | None, max_pixels: int
         if not start:
             raise ValueError("the file is empty; write the image again.")
         if start.startswith(b"PK"):
-            return Pixels(read_npz(stream, array, max_pixels))
+            return Pixels.of_array(read_npz(stream, array, max_pixels))
         if start.startswith(b"\x93NUMPY"):
-            return Pixels(read_npy(stream, os.fstat(stream.fileno()).st_size, max_pixels))
+            return Pixels.of_array(read_npy(stream, os.fstat(stream.fileno()).st_size, max_pixels))
         if start.startswith(MAGIC):
             return read_tiff(stream, page, max_pixels)
         return _read_with_pillow(stream, page, max_pixels)

@@ -113,7 +113,9 @@ class PointCloud(eqx.Module):
         box = self.box(outline)
         width, height = box[2] - box[0], box[3] - box[1]
         if shape is None:
-            side = np.sqrt(PER_PIXEL * width * height / self.n_points)
+            x, y = np.asarray(self.x, np.float64), np.asarray(self.y, np.float64)
+            n_within = max(1, int(((x >= box[0]) & (x <= box[2]) & (y >= box[1]) & (y <= box[3])).sum()))
+            side = np.sqrt(PER_PIXEL * width * height / n_within)
             shape = max(2, round(height / side) + 1), max(2, round(width / side) + 1)
         if len(shape) != 2 or min(shape) < 2:
             raise ValueError(f"shape = {shape}; an image of points has at least 2 x 2 pixels (ny, nx).")

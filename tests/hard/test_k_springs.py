@@ -679,7 +679,7 @@ def surfaces(image):
     mesh, net = rec.Subdivision.of([(0, 1, 2)], 3), js.from_triangles([(0, 1, 2)], 3)
     return (
         *(tin, tin.errors(image), breaks, rec.BrokenSurface(tin, breaks, points, tin, 1.0, 1.0)),
-        *(mesh, rec.Refined(mesh, mesh, points, np.ones(3)), rec.BoundedSurface(tin, 1.0, 1.0, True, 0, (0, 0))),
+        *(mesh, rec.Refined(mesh, mesh, points, np.ones(3)), rec.BoundedSurface(tin, 1.0, 1.0, True, 0, (0, 0), 0)),
         *(rec.SlidingBorder(net, points), rec.PlanarSettings(), rec.PlanarFit(tin, np.ones(3), None, js.Status.ok())),
         rec.Shell(*rec.icosahedron(), (1.0,), (12,), ()),
     )

@@ -165,8 +165,11 @@ class Lens(eqx.Module):
 def _evenness(share: Array, log_wanted: Array) -> Array:
     """Radial over tangential stretch of a context that is squeezed evenly, ln(m R) / ln R for a disc, from the areas of the foci."""
     before, after = jnp.mean(share), jnp.mean(share * jnp.exp(2 * log_wanted))
-    # Shrunk foci squeeze nothing, and nothing helps those that fill the image.
-    return jnp.clip(jnp.log(jnp.minimum(after, 0.99)) / jnp.log(before), 0, 1)
+    # Shrunk foci squeeze nothing, and nothing helps those that fill the image; no focus at all is the limit of small ones.
+    is_some = (before > 0) & (before < 1)
+    before, after = (jnp.where(is_some, a, jnp.full_like(a, 0.5)) for a in (before, after))
+    evenness = jnp.clip(jnp.log(jnp.minimum(after, 0.99)) / jnp.log(before), 0, 1)
+    return jnp.where(is_some, evenness, jnp.ones_like(evenness))
 
 
 def _bounded(log_weight: Array) -> Array:

@@ -15,6 +15,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from ..._arrays import Numbers
+from ..._checks import as_inexact
 from ...forces.springs import Springs
 from ...images.image import Image, without_holes
 from ...images.sampling import Sampling
@@ -78,16 +80,18 @@ class Warp(eqx.Module):
     shares: tuple[Array, ...]
     status: Status
 
-    def forward(self, x: Array, y: Array) -> tuple[Array, Array]:
+    def forward(self, x: Numbers, y: Numbers) -> tuple[Array, Array]:
         """Where the points (x, y) of the image are shown, two arrays of any one shape [pixels]; beyond the border as triangles go on."""
+        x, y = as_inexact("x", x), as_inexact("y", y)
         hx, hy = self.mesh.cell_size
         flat_x, flat_y = jnp.ravel(x), jnp.ravel(y)
         triangle = triangle_at(flat_x / hx, flat_y / hy, self.mesh.cells)
         shown = Affine.between(self.mesh.x, self.mesh.y, self.position.x, self.position.y)(flat_x, flat_y, triangle)
         return shown[0].reshape(x.shape), shown[1].reshape(x.shape)
 
-    def inverse(self, x: Array, y: Array) -> tuple[Array, Array]:
+    def inverse(self, x: Numbers, y: Numbers) -> tuple[Array, Array]:
         """Which points of the image are shown at (x, y), two arrays of any one shape [pixels]: the exact inverse of `forward`."""
+        x, y = as_inexact("x", x), as_inexact("y", y)
         flat_x, flat_y = jnp.ravel(x), jnp.ravel(y)
         back = Affine.between(self.position.x, self.position.y, self.mesh.x, self.mesh.y)
         found = search(back, flat_x, flat_y, self.mesh.cells, self.mesh.cell_size)
@@ -98,7 +102,7 @@ class Warp(eqx.Module):
         """The image as the lens shows it: at each pixel the value from where that pixel comes.
 
         Args:
-            image: a `js.Image`, or pixels (..., ny, nx) of one image or several.
+            image: a `js.Image`, or pixels (..., ny, nx) of one image or several; whole numbers are rounded to such.
 
         Raises:
             ValueError: an image of another shape, or with weights.
@@ -209,8 +213,14 @@ class Warp(eqx.Module):
 
     def _read(self, values: Array, x: Array, y: Array) -> Array:
         one, zero = jnp.ones((), x.dtype), jnp.zeros((), x.dtype)
-        surface = Surface(self.sampling.coefficients(values), (one, one), (zero, zero), self.shape, self.sampling)
-        return surface.value(x, y).astype(values.dtype)
+        levels = values if jnp.issubdtype(values.dtype, jnp.inexact) else values.astype(x.dtype)
+        surface = Surface(self.sampling.coefficients(levels), (one, one), (zero, zero), self.shape, self.sampling)
+        shown = surface.value(x, y)
+        if jnp.issubdtype(values.dtype, jnp.inexact):
+            return shown.astype(values.dtype)
+        # To the nearest grey level, within their range: cut off, every picture would become darker.
+        low, high = (0, 1) if values.dtype == bool else (jnp.iinfo(values.dtype).min, jnp.iinfo(values.dtype).max)
+        return jnp.clip(jnp.rint(shown), low, high).astype(values.dtype)
 
     def _check_shape(self, shape: tuple[int, ...]) -> None:
         if tuple(shape) != self.shape:
@@ -222,8 +232,11 @@ class Warp(eqx.Module):
         return doubled_areas(self.position.x, self.position.y, jnp.asarray(turned(self.mesh.cells))) / (hx * hy)
 
     def _mean_over(self, share: Array, values: Array) -> Array:
-        corners = share[:-1, :-1] * share[:-1, 1:] * share[1:, :-1] * share[1:, 1:]
-        weight = corners**8
+        # Over the largest share, so that faint foci count as strong ones do; where no cell lies within one, all count alike.
+        largest = jnp.max(share)
+        share = share / jnp.where(largest > 0, largest, jnp.ones_like(largest))
+        weight = (share[:-1, :-1] * share[:-1, 1:] * share[1:, :-1] * share[1:, 1:]) ** 8
+        weight = jnp.where(jnp.sum(weight) > 0, weight, jnp.ones_like(weight))
         return jnp.exp(jnp.sum(weight * values) / jnp.sum(weight))
 
 

@@ -24,11 +24,12 @@ class BoundedSurface:
 
     Attributes:
         tin: nodes, triangles, heights.
-        greatest: its largest error over all pixels [unit of the image].
+        greatest: its largest error over the pixels under its triangles [unit of the image].
         rmse: root mean square error.
         holds: whether the bound does.
         n_splits: how often triangles were split.
         worst: (row, column) of the pixel of the largest error.
+        outside: how many pixels with data lie under no triangle: of them nothing is bounded.
     """
 
     tin: Tin
@@ -37,10 +38,11 @@ class BoundedSurface:
     holds: bool
     n_splits: int
     worst: tuple[int, int]
+    outside: int
 
 
 def bound_error(image: Image, points: Numbers, triangles: Numbers, bound: Numbers, most: int | None = None) -> BoundedSurface:
-    """Split triangles until no pixel is farther from the surface than a bound.
+    """Split triangles until no pixel under one is farther from the surface than a bound.
 
     Args:
         image: the data.
@@ -79,7 +81,8 @@ def bound_error(image: Image, points: Numbers, triangles: Numbers, bound: Number
             worst = divmod(int(error.argmax()), image.shape[1])
             rmse = weighted_rms(error, weights * (located.triangle >= 0))
             tin = Tin(np.column_stack([now, z]), mesh.triangles)
-            return BoundedSurface(tin, float(error.max()), rmse, finer is mesh, n_splits, worst)
+            outside = int(((located.triangle < 0) & (weights > 0)).sum())
+            return BoundedSurface(tin, float(error.max()), rmse, finer is mesh, n_splits, worst, outside)
         mesh, n_splits = finer, n_splits + 1
 
 

@@ -169,8 +169,12 @@ def assembled(net: Topology, field: HeightField, step: float, broken: np.ndarray
 
 
 def _priced(field: HeightField, step: float) -> tuple[np.ndarray, np.ndarray]:
-    """K of each spring in a chain of its like, and the price of breaking it."""
-    both = 0.5 * (field.data_stiffness[field.edges[:, 0]] + field.data_stiffness[field.edges[:, 1]])
+    """K of each spring in a chain of its like, and the price of breaking it. In a hole it is what it would be with data: free of charge,
+    any slope would break there.
+    """
+    known = field.data_stiffness > 0
+    at_nodes = np.where(known, field.data_stiffness, field.data_stiffness[known].mean())
+    both = 0.5 * (at_nodes[field.edges[:, 0]] + at_nodes[field.edges[:, 1]])
     chain = np.asarray(step_stiffness(field.stiffness, both), np.float64)
     return chain, 0.5 * chain * step**2
 

@@ -189,7 +189,7 @@ def point_heights(
             positive(name, value, "Without it nothing holds a node that no point reaches." if name == "membrane" else "It is a residual.")
     refuse_folds(x, y, flip)
     inside, grid, start = places_of(cloud, x, y)
-    low, extent = float(jnp.min(cloud.z)), float(jnp.ptp(cloud.z)) or 1.0
+    low, extent = _scale(np.asarray(cloud.z, np.float64))
     delta = None if huber is None else jnp.asarray(huber / extent, x.dtype)
     values = (cloud.z[jnp.asarray(np.flatnonzero(inside))] - low) / extent
     found = best_of_points(grid, values, start, x, y, flip, jnp.asarray(membrane, x.dtype), delta)
@@ -209,6 +209,12 @@ def point_heights(
         n_reweightings=int(found.n_done),
         is_settled=int(found.n_crossed) == 0,
     )
+
+
+def _scale(z: np.ndarray) -> tuple[float, float]:
+    """A height and a range by which heights become numbers of about one: of most points, since an outlier may be anywhere."""
+    low, high = np.quantile(z, [0.02, 0.98])
+    return float(low), float(high - low) or float(np.ptp(z)) or 1.0
 
 
 class _Problem(eqx.Module):

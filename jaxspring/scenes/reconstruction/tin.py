@@ -24,6 +24,8 @@ from .given import cross, differences, factored, pixel_weights, plane_points, we
 
 # Within so much of its edges a pixel counts as inside a triangle, in barycentric coordinates.
 EDGE = 1e-9
+# Of a coordinate in pixels, from a spacing and an origin of single precision; and the most that is taken for rounding [pixels].
+ROUNDING, MOST_ROUNDING = 16 * float(np.finfo(np.float32).eps), 0.05
 # Pairs of triangle and pixel looked at together.
 CHUNK = 2_000_000
 # Springs along z over the pixels that a node has on average: decides heights that no pixel does.
@@ -52,6 +54,10 @@ def locate_pixels(image: Image, points: np.ndarray, triangles: np.ndarray) -> Lo
     """The triangle that holds each pixel, and the weights of its corners; where triangles overlap, that in which it lies deepest."""
     (ny, nx), (sx, sy), (ox, oy) = image.shape, map(float, image.spacing), map(float, image.origin)
     local = (points[:, :2].astype(np.float64) - [ox, oy]) / [sx, sy]
+    # A node on the border is there, though the image keeps its spacing and origin in fewer digits.
+    last, rounding = np.array([nx - 1, ny - 1]), ROUNDING * np.array([abs(ox / sx) + nx, abs(oy / sy) + ny])
+    local = np.where(np.abs(local) < np.minimum(rounding, MOST_ROUNDING), 0.0, local)
+    local = np.where(np.abs(local - last) < np.minimum(rounding, MOST_ROUNDING), last, local)
     a, b, c = (local[triangles[:, i]] for i in range(3))
     corners = np.stack([a, b, c])
     low = np.maximum(np.ceil(corners.min(axis=0) - EDGE), 0).astype(np.int64)
@@ -99,7 +105,8 @@ def fitted_heights(
     n, edges = net.n_nodes, np.asarray(net.edges)
     difference = differences(edges, n)
     normal = matrix.T @ diags_array(weights) @ matrix
-    ratio = membrane * max(float(normal.sum()), 1.0) / n
+    weight = float(normal.sum())
+    ratio = membrane * (weight if weight > 0 else 1.0) / n
     held = np.ones(len(edges)) if whole is None else np.where(whole, 1.0, 1e-6)
     middle = float(np.average(data, weights=weights))
     system = normal + ratio * (difference.T @ diags_array(held) @ difference)

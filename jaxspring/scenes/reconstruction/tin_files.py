@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 
+import jax
 import numpy as np
 
 from ...archive import Path, atomic_file
@@ -49,11 +50,12 @@ def save_tin(path: Path, tin: Tin, lines: Sequence[np.ndarray] = ()) -> None:
             stream.write(_geojson(tin, lines))
         return
     net = tin.net
-    state = State.from_points(net, tin.points)
-    if place.suffix.lower() == ".obj":
-        save_obj(place, state, net)
-    else:
-        save_ply(place, state, net, triangles=net.triangles)
+    with jax.enable_x64(True):  # single precision would round map coordinates to half a metre
+        state = State.from_points(net, tin.points)
+        if place.suffix.lower() == ".obj":
+            save_obj(place, state, net)
+        else:
+            save_ply(place, state, net, triangles=net.triangles)
 
 
 def _geojson(tin: Tin, lines: Sequence[np.ndarray]) -> bytes:

@@ -141,7 +141,8 @@ def examine(net: Topology, points: Numbers, triangles: Numbers | None = None) ->
     sides = Sides(corners)
     piece = pieces(sides, len(corners))
     two_sided, _ = winding(corners, sides)
-    is_wound = bool(sides.shared()[3].all())
+    _, one, _, alike = sides.shared()
+    is_wound = bool(alike.all())
     lengths = np.stack([np.linalg.norm(places[corners[:, k - 1]] - places[corners[:, k - 2]], axis=1) for k in range(3)], axis=-1)
     twice = np.linalg.norm(np.cross(places[corners[:, 1]] - places[corners[:, 0]], places[corners[:, 2]] - places[corners[:, 0]]), axis=1)
     flat = twice <= FLAT * lengths.max(axis=1) ** 2
@@ -152,7 +153,7 @@ def examine(net: Topology, points: Numbers, triangles: Numbers | None = None) ->
     first = first[inverse.ravel()]
     later = np.flatnonzero(first != np.arange(len(places)))
     n_pieces = int(piece.max()) + 1
-    open_pieces = np.isin(np.arange(n_pieces), piece[_at_border(sides, len(corners))])
+    has_no_volume = np.isin(np.arange(n_pieces), np.concatenate([piece[_at_border(sides, len(corners))], piece[one[~alike]]]))
     volumes = np.bincount(piece, signed_volumes(places, corners), n_pieces)
     return MeshReport(
         n_triangles=len(corners),
@@ -165,7 +166,7 @@ def examine(net: Topology, points: Numbers, triangles: Numbers | None = None) ->
         doubled=np.stack([first[later], later], axis=-1),
         flat=np.flatnonzero(flat),
         least_angle=float(np.degrees(np.arcsin(np.clip(sine.min(), 0.0, 1.0)))),
-        volumes=np.where(open_pieces | (not is_wound), np.nan, volumes),
+        volumes=np.where(has_no_volume, np.nan, volumes),
     )
 
 

@@ -103,6 +103,29 @@ def test_a_mesh_of_ones_own_hangs_from_its_top(tmp_path):
         command._of_file(str(tmp_path / "bent.obj"), FEW)
 
 
+def test_a_mesh_with_two_holes_and_a_turned_triangle_hangs(tmp_path):
+    """What springs and hinges do not mind the command does not refuse; fine meshes are held by one row; the checkpoint knows the mesh."""
+    net, points = js.cloth.rectangle(0.2, 0.2, 0.05)
+    triangles = np.asarray(net.triangles).copy()
+    triangles[0] = triangles[0][::-1]
+    made = scene.with_mesh(FEW, js.from_triangles(triangles, len(points)), points)
+    assert held_of(made).sum() == (points[:, 1] > 0.19).sum()
+    assert len(made.border) == 0
+    fine, places = js.cloth.rectangle(0.05, 0.4, 0.004)
+    assert len(np.unique(places[held_of(scene.with_mesh(FEW, fine, places)), 1].round(6))) == 1
+    one, other = (job.ClothRun("mine", scene.with_mesh(FEW, net, size * points)) for size in (1.0, 3.0))
+    one._write(tmp_path / "run.npz")
+    with pytest.raises(js.CheckpointError, match="mesh"):
+        other.read(tmp_path / "run.npz")
+
+
+@pytest.mark.parametrize("arguments", [("hanging", "--wind", "3"), ("drape", "--size", "0.3"), ("mine.obj", "--spacing", "0.1")])
+def test_what_a_scene_does_not_read_is_refused(arguments, tmp_path, capsys):
+    """An option that does nothing is an error that names it."""
+    assert main(["cloth", *arguments, "--out", str(tmp_path / "out")]) != 0
+    assert arguments[1] in capsys.readouterr().err
+
+
 def test_the_drape_coefficient_of_shadows_known():
     """1 flat, and (s^2 R^2 - r^2) / (R^2 - r^2) of a disc shrunk by s, up to the polygon's area; its gradient is the differences'."""
     made = js.cloth.cusick(js.cloth.ClothSettings(spacing=0.01))

@@ -12,22 +12,26 @@ from ..command import Command, UnusableError, Written, add_out, number, out_fold
 NAMES = ("hanging", "ball", "table", "flag", "cantilever", "drape")
 FABRICS = ("interlock", "denim", "swim-knit")
 MOST_NODES = 20_000
+# Options that a scene does not read.
+UNREAD = {"flag": (), "drape": ("size", "wind"), **dict.fromkeys(("hanging", "ball", "table", "cantilever"), ("wind",))}
+UNREAD_BY_FILES = ("size", "spacing", "wind")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What `jaxspring cloth` takes."""
     parser.add_argument(
-        "scene", metavar="SCENE", nargs="?", default="hanging", help=f"one of {', '.join(NAMES)} (hanging), or a file of a flat mesh"
-    )
+        "scene", metavar="SCENE", nargs="?", default="hanging",
+        help=f"one of {', '.join(NAMES)} (hanging), or a file of a flat mesh in the plane z = 0, in metres, which hangs from its largest y",
+    )  # fmt: skip
     parser.add_argument(
         "--fabric", type=fabric, metavar="NAME", default="interlock",
         help=f"{', '.join(FABRICS)}, or numbers DENSITY,C11,C22,SHEAR,B in kg/m^2, N/m and N m (interlock)",
     )  # fmt: skip
-    parser.add_argument("--size", type=number, metavar="M", help="side of the sheet in metres (0.5)")
-    parser.add_argument("--spacing", type=number, metavar="M", help="of the nodes in metres (0.02)")
+    parser.add_argument("--size", type=number, metavar="M", help="side of the sheet in metres (0.5); not of drape or a file")
+    parser.add_argument("--spacing", type=number, metavar="M", help="of the nodes in metres (0.02); not of a file")
     parser.add_argument("--duration", type=number, metavar="S", help="simulated time in seconds (2)")
     parser.add_argument("--dt", type=number, metavar="S", help="time step in seconds (0.01)")
-    parser.add_argument("--wind", type=number, metavar="V", help="speed of the air on the flag in m/s (6)")
+    parser.add_argument("--wind", type=number, metavar="V", help="speed of the air in m/s, of the flag alone (6)")
     add_out(parser, "jaxspring-cloth")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint of an interrupted run with the same DIR")
 
@@ -42,6 +46,9 @@ def run(given: argparse.Namespace, out: pathlib.Path) -> Written:
     from .job import cloth_job
     from .scene import SCENES, ClothSettings
 
+    for name in UNREAD.get(given.scene, UNREAD_BY_FILES):
+        if getattr(given, name) is not None:
+            raise UnusableError(f"--{name} says nothing to {given.scene}: leave it out. A mesh has its own size, Cusick's disc as well.")
     given.material = _material(given.fabric)
     settings = settings_of(ClothSettings, given, ("material", "size", "spacing", "duration", "dt", "wind"))
     try:

@@ -5,6 +5,7 @@ Until the folder is whole there is a checkpoint beside it, from which a later ca
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import pathlib
 from dataclasses import dataclass
@@ -71,7 +72,8 @@ class ClothRun(PartedRun):
     def __init__(self, name: str, scene: ClothScene):
         self.scene = scene
         settings = scene.settings
-        about = {"kind": f"cloth {name}", "settings": numbers_of(scene)}
+        drawn = np.ascontiguousarray(scene.points).tobytes() + np.ascontiguousarray(scene.triangles).tobytes()
+        about = {"kind": f"cloth {name}", "settings": numbers_of(scene), "mesh": hashlib.sha256(drawn).hexdigest()[:16]}
         n_steps = max(1, round(settings.duration / settings.dt))
         super().__init__(scene.system, scene.state, scene.stepper, n_steps, settings.duration, _Look(scene.system), about)
 

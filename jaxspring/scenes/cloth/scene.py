@@ -94,7 +94,7 @@ class ClothScene(eqx.Module):
         state: the start.
         stepper: for `js.rollout`.
         obstacle: what it lies on, or None.
-        border: (B,) nodes around the sheet, in order.
+        border: (B,) nodes around the sheet, in order; none of a mesh of the user's, which may have several.
         settings: the numbers (static).
     """
 
@@ -255,9 +255,10 @@ def cusick(settings: ClothSettings) -> ClothScene:
 
 
 def with_mesh(settings: ClothSettings, net: Any, points: np.ndarray) -> ClothScene:
-    """A flat mesh of the user's, held where it is highest along y, and hanging from there."""
-    held = points[:, 1] > points[:, 1].max() - 0.02 * np.ptp(points[:, 1])
-    return _scene(settings, net, points, held)
+    """A flat mesh of the user's, held where it is highest along y, to a quarter of an edge, and hanging from there."""
+    edge = np.median(np.linalg.norm(np.diff(points[np.asarray(net.edges)], axis=1)[:, 0], axis=1))
+    held = points[:, 1] > points[:, 1].max() - 0.25 * edge
+    return _scene(settings, net, points, held, has_border=False)
 
 
 class _Gusts(eqx.Module):
@@ -280,6 +281,7 @@ def _scene(
     obstacle: Obstacle | None = None,
     places: np.ndarray | None = None,
     wind: Any = None,
+    has_border: bool = True,
 ) -> ClothScene:
     cloth = fabric(net, flat, settings.material)
     air = Air(net, drag=1.2, friction=0.02, wind=wind)
@@ -288,8 +290,8 @@ def _scene(
     system = System(net, cloth.mass, forces, free=None if held is None else ~held, rules=rules)
     state = State.from_points(net, flat if places is None else places)
     triangles = np.asarray(net.triangles)
-    border = max(borders(triangles), key=len)
-    return ClothScene(cloth, triangles, flat, system, state, BackwardEuler(), obstacle, np.asarray(border), settings)
+    border = np.asarray(max(borders(triangles), key=len) if has_border else [], int)
+    return ClothScene(cloth, triangles, flat, system, state, BackwardEuler(), obstacle, border, settings)
 
 
 SCENES: dict[str, Builder] = {

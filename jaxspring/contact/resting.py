@@ -20,7 +20,7 @@ from jaxtyping import Array
 
 from ..forces.base import Rule
 from ..forces.contact import Floor
-from ..forces.planes import counted_from, is_slow
+from ..forces.planes import ROUNDING, counted_from, is_slow
 from ..state import State
 from ..vector import Vector
 from .frames import Frame, frame_of
@@ -98,8 +98,10 @@ class Resting(eqx.Module):
         normals, rates, speeds, lies, grips, rounding, ends = [], [], [], [], [], [], []
         surfaces = [surface_of(rule, state) for rule in obstacles if isinstance(rule, (Floor, Contact))]
         drag = drag_at_end = Vector.zeros_like(x)
+        # A place is no better known than the way of a step: at the origin its own rounding is none.
+        way = (ROUNDING * float(jnp.finfo(x.dtype).eps)) * span * (v.norm() + span * acceleration.norm())
         for surface in surfaces:
-            least = surface.rounding(x)
+            least = surface.rounding(x) + way
             base = counted_from(surface.distance(x, state.time), least)
             touch = surface.touch(x, now, base)
             is_on = (touch.height <= least) & is_slow(touch.speed(v), acceleration.norm(), span, least)

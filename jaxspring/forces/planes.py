@@ -137,4 +137,4 @@ def pick(chosen: tuple[Array, ...], values: tuple[Array, ...]) -> Array:
     return found
 
 
-__all__ = ["Plane", "bounces", "braked", "counted_from", "halted", "is_slow", "meeting", "pick", "without"]
+__all__ = ["ROUNDING", "Plane", "bounces", "braked", "counted_from", "halted", "is_slow", "meeting", "pick", "without"]

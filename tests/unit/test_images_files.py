@@ -69,6 +69,7 @@ def test_colour_is_refused_unless_told_how(save, rng, mode, n_channels):
 def test_luminance_weights_and_channels(rng):
     """0.299 R + 0.587 G + 0.114 B whatever the type; Channel takes one; a channel that is not there is named."""
     pixels = rng.integers(0, 256, (4, 5, 4)).astype(np.uint8)
+    pixels[..., 3] = 255  # opaque
     expected = pixels[..., 0] * 0.299 + pixels[..., 1] * 0.587 + pixels[..., 2] * 0.114
     np.testing.assert_allclose(image_from_array(pixels, Luminance()).values, expected, rtol=1e-12)
     np.testing.assert_array_equal(image_from_array(pixels, Channel(2)).values, pixels[..., 2])

@@ -32,9 +32,9 @@ class Closure(eqx.Module):
     rebuild: Callable[[list[Any]], Callable[..., Any]] = eqx.field(static=True)
     values: list[Any]
 
-    def __call__(self, *arguments: Any, **named: Any) -> Any:
+    def __call__(self, *arguments: Any) -> Any:
         """What the function returns."""
-        return self.rebuild(self.values)(*arguments, **named)
+        return self.rebuild(self.values)(*arguments)
 
 
 def opened(effect: Any, name: str) -> Any:

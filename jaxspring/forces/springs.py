@@ -150,8 +150,7 @@ class Springs(Force):
             stiffness = vanishing(self.net, cast_inexact(stiffness, scene.dtype))
         rest_length = cast_inexact(self.net.edge_field(self.rest_length, "rest_length"), scene.dtype)
         rest_length = self.net.at_ends(rest_length) if isinstance(rest_length, EdgeField) else rest_length
-        actuation = None if self.actuation is None else self.actuation.bind(self.net, scene.dtype)
-        bound = (stiffness, rest_length, actuation)
+        bound = (stiffness, rest_length, None if self.actuation is None else self.actuation.bind(self.net, scene.dtype))
         made = eqx.tree_at(lambda s: (s.stiffness, s.rest_length, s.actuation), self, bound, is_leaf=lambda leaf: leaf is None)
         return cast_inexact(made, scene.dtype)
 
@@ -165,7 +164,7 @@ class Springs(Force):
         return None if self.actuation is None else self.actuation.command(self.net, state)
 
     def renew(self, memory: Any, state: State) -> Any:
-        """The command of the controller that drives them now, whoever drove them in an earlier run."""
+        """The command of the controller that drives them now."""
         return self.remember(state)
 
     def update(self, step: Step, state: State) -> tuple[State, Status]:
@@ -177,8 +176,7 @@ class Springs(Force):
         if self.net.n_springs == 0:
             return Vector.zeros_like(state.position)
         k, l = self._constants(state)
-        if not self.net.has_margins and self.law.needs_no_mask:
-            k = vanishing(self.net, k)
+        k = vanishing(self.net, k) if not self.net.has_margins and self.law.needs_no_mask else k
         vanishes = isinstance(k, ZeroOutside) and self.law.needs_no_mask
         if self.net.has_margins and not vanishes:
             return self._embed(self.net.accumulate(self._each(state, _Pull(self.law))), state)

@@ -14,6 +14,7 @@ LAYERS = {
     "_lazy": 0,
     "_names": 0,  # a table of strings, though of the names of all layers
     "numerics": 0,
+    "closures": 0,  # functions opened for derivatives
     "facts": 0,
     "printing": 0,
     "status": 0,

@@ -26,19 +26,18 @@ def ended(rule, start, pull, stepper, n_steps=40):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("ground", "slopes"), [("floor", (0.3, 0.0)), ("ball", (0.345, 0.45))])
-def test_dropped_straight_down_friction_stops_any_small_speed(ground, slopes):
-    """Friction takes all of a small speed along the ground: so the derivative by that speed says, also where it is zero. On the ball, of
-    radius 1, the node lands 0.3 m per m/s aside, and bounces off as the normal there turns: from dx/dv = t = 0.3 s to 0.3 + 0.45 * 0.1.
+def test_dropped_straight_down_friction_stops_any_small_speed():
+    """Friction takes all of a small speed along a ball: so the derivative by that speed says, also where it is zero. On a ball of radius
+    1 the node lands 0.3 m per m/s aside, and bounces off as the normal there turns: from dx/dv = t = 0.3 s to 0.3 + 0.45 * 0.1.
     """
 
     def end(vx):
-        return ended(GROUND[ground](0.5, 0.5), (0.0, 0.45, vx), jnp.zeros_like(vx), js.VelocityVerlet())
+        return ended(GROUND["ball"](0.5, 0.5), (0.0, 0.45, vx), jnp.zeros_like(vx), js.VelocityVerlet())
 
     both = jax.jit(lambda vx: (end(vx), jax.jacrev(end)(vx)))
     difference = (both(1e-5)[0] - both(-1e-5)[0]) / 2e-5
-    np.testing.assert_allclose(difference, slopes, atol=1e-9)
-    np.testing.assert_allclose(both(0.0)[1], slopes, atol=1e-12)
+    np.testing.assert_allclose(difference, (0.345, 0.45), atol=1e-9)
+    np.testing.assert_allclose(both(0.0)[1], (0.345, 0.45), atol=1e-12)
 
 
 @pytest.mark.slow
@@ -46,7 +45,6 @@ def test_dropped_straight_down_friction_stops_any_small_speed(ground, slopes):
     ("ground", "stepper", "slopes"),
     [
         ("floor", js.VelocityVerlet(), jax.jacrev),
-        ("floor", js.BackwardEuler(), jax.jacfwd),
         ("box", js.SymplecticEuler(), jax.jacfwd),
     ],
 )

@@ -55,9 +55,8 @@ def opened(effect: Any, name: str) -> Any:
 def _opened(value: Any, name: str, within: frozenset[int]) -> Any:
     if not callable(value) or not _holds_traced(value, _DEPTH, set()):
         return value
-    inner = _wrapped(value)
-    if inner is not None:
-        return _opened(inner, name, within)
+    if not isinstance(value, types.FunctionType) and hasattr(value, "__wrapped__"):  # by jax.jit and its like
+        return _opened(getattr(value, "__wrapped__", None), name, within)
     if isinstance(value, functools.partial):
         parts, make = (value.func, value.args, value.keywords), _as_partial
     elif isinstance(value, types.FunctionType) and id(value) not in within:
@@ -102,11 +101,6 @@ def _as_function(like: types.FunctionType, cells: tuple[Any, ...], defaults: Any
     return made
 
 
-def _wrapped(value: Any) -> Any:
-    """What `jax.jit` and its like have wrapped; None where it is no such thing."""
-    return None if isinstance(value, types.FunctionType) else getattr(value, "__wrapped__", None)
-
-
 def _holds_traced(value: Any, depth: int, seen: set[int]) -> bool:
     """Whether a value is traced, or holds something that is: in a pytree, a function or an object."""
     if isinstance(value, Tracer):
@@ -117,7 +111,4 @@ def _holds_traced(value: Any, depth: int, seen: set[int]) -> bool:
     leaves = jax.tree.leaves(value)
     if len(leaves) != 1 or leaves[0] is not value:
         return any(_holds_traced(leaf, depth - 1, seen) for leaf in leaves)
-    inner = _wrapped(value)
-    if inner is None:
-        inner = held_by(value) if callable(value) else attributes(value)
-    return _holds_traced(inner, depth - 1, seen)
+    return _holds_traced(held_by(value) if callable(value) else attributes(value), depth - 1, seen)

@@ -69,6 +69,14 @@ def user_mode():
         yield
 
 
+@pytest.fixture
+def sooner():
+    """Programs that run a few times need no optimisation."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
 @pytest.fixture(params=["float32", "float64"])
 def dtype(request) -> np.dtype:
     """Each of the two precisions in turn, both under the strict flags."""

@@ -14,8 +14,10 @@ with bisection as in Press and others, Numerical Recipes (2007), 9.4.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
@@ -27,17 +29,25 @@ NARROWINGS = 24  # looks at a dip, at most
 ITERATIONS = 60  # of Newton's method: a bisection alone would need as many as a number has digits
 
 
-class _March(NamedTuple):
-    """Where the search stands: time, distance there and its slope; the end of a dip that is looked into, distance and slope there, and how
-    often it was looked at, 0 where there is none; the interval of the root, whether it is found, whether the search goes on.
-    """
+class _Seen(NamedTuple):
+    """A time, the distance there and its slope."""
 
     s: Array
     value: Array
     slope: Array
-    beyond: Array
-    value_beyond: Array
-    slope_beyond: Array
+
+    def or_else(self, condition: Array, other: _Seen) -> _Seen:
+        """What was seen here where the condition holds, else there."""
+        return jax.tree.map(partial(jnp.where, condition), self, other)
+
+
+class _March(NamedTuple):
+    """Where the search stands; the end of a dip that is looked into, and how often it was looked at, 0 where there is none; the interval
+    of the root, whether it is found, whether the search goes on.
+    """
+
+    here: _Seen
+    beyond: _Seen
     looks: Array
     low: Array
     high: Array
@@ -59,46 +69,39 @@ def first_root(
         is_wanted: which nodes are looked at.
     """
     least, speed = end / SHORTEST, jnp.maximum(speed, tiny(speed.dtype))
-    value, slope = distance(begin)
-    is_passed = is_wanted & (value < -rounding)
+    here = _Seen(begin, *distance(begin))
+    is_passed = is_wanted & (here.value < -rounding)
     never = jnp.zeros(jnp.shape(begin), jnp.int32)
-    start = _March(
-        begin, value, slope, begin, value, slope, never, jnp.zeros_like(begin), begin, is_passed, is_wanted & ~is_passed & (begin < end)
-    )
+    start = _March(here, here, never, jnp.zeros_like(begin), begin, is_passed, is_wanted & ~is_passed & (begin < end))
 
     def further(at: _March) -> _March:
         within = at.looks > 0
-        ahead = jnp.minimum(at.s + jnp.maximum(at.value / speed, least), end)
-        s = jnp.where(within, _crossing(at, at.beyond, at.value_beyond, at.slope_beyond)[0], ahead)
-        value, slope = distance(s)
-        is_in = at.is_open & (value < -rounding)
+        ahead = jnp.minimum(at.here.s + jnp.maximum(at.here.value / speed, least), end)
+        s = jnp.where(within, _crossing(at.here, at.beyond)[0], ahead)
+        seen = _Seen(s, *distance(s))
+        is_in = at.is_open & (seen.value < -rounding)
         # The part that falls at its begin and rises at its end.
-        falls = slope <= 0
-        old = at.beyond, at.value_beyond, at.slope_beyond
-        right = tuple(jnp.where(within & falls, a, b) for a, b in zip(old, (s, value, slope), strict=True))
-        left = tuple(jnp.where(within & falls, b, a) for a, b in zip((at.s, at.value, at.slope), (s, value, slope), strict=True))
-        part = at._replace(s=left[0], value=left[1], slope=left[2])
-        lowest, bottom = _crossing(part, *right)
-        dips = (left[2] < 0) & (right[2] > 0) & (left[0] < lowest) & (lowest < right[0])
+        falls = within & (seen.slope <= 0)
+        left, right = seen.or_else(falls, at.here), at.beyond.or_else(falls, seen)
+        lowest, bottom = _crossing(left, right)
+        dips = (left.slope < 0) & (right.slope > 0) & (left.s < lowest) & (lowest < right.s)
         looks_on = at.is_open & ~is_in & dips & ((at.looks == 0) | (bottom < -rounding)) & (at.looks < NARROWINGS)
-        low, high = (jnp.where(is_in, new, old) for new, old in ((at.s, at.low), (s, at.high)))
-        at_begin = tuple(jnp.where(looks_on, a, b) for a, b in zip(left, right, strict=True))
-        ended = ~looks_on & ~(at_begin[0] < end)  # NaN ends it
+        low, high = (jnp.where(is_in, new, old) for new, old in ((at.here.s, at.low), (s, at.high)))
+        here = left.or_else(looks_on, right)
+        ended = ~looks_on & ~(here.s < end)  # NaN ends it
         looks = jnp.where(looks_on, at.looks + 1, 0)
-        (s, value, slope), (far, value_far, slope_far) = at_begin, right
-        is_found, is_open = at.is_found | is_in, at.is_open & ~is_in & ~ended
-        return _March(s, value, slope, far, value_far, slope_far, looks, low, high, is_found, is_open)
+        return _March(here, right, looks, low, high, at.is_found | is_in, at.is_open & ~is_in & ~ended)
 
     found = lax.while_loop(lambda at: jnp.any(at.is_open), further, start)
     return _polished(distance, found), found.is_found
 
 
-def _crossing(at: _March, s: Array, value: Array, slope: Array) -> tuple[Array, Array]:
+def _crossing(a: _Seen, b: _Seen) -> tuple[Array, Array]:
     """Where the tangents at the ends of an interval cross [s], and how high [m]; at its end where they do not cross within."""
-    turns = (at.slope < 0) & (slope > 0)
-    steps = jnp.where(turns, at.slope - slope, -jnp.ones_like(slope))
-    lowest = jnp.where(turns, jnp.clip(at.s + (value - at.value - slope * (s - at.s)) / steps, at.s, s), s)
-    return lowest, value + slope * (lowest - s)
+    turns = (a.slope < 0) & (b.slope > 0)
+    steps = jnp.where(turns, a.slope - b.slope, -jnp.ones_like(b.slope))
+    lowest = jnp.where(turns, jnp.clip(a.s + (b.value - a.value - b.slope * (b.s - a.s)) / steps, a.s, b.s), b.s)
+    return lowest, b.value + b.slope * (lowest - b.s)
 
 
 def _polished(distance: Callable[[Array], tuple[Array, Array]], found: _March) -> Array:

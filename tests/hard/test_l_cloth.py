@@ -43,14 +43,6 @@ BENDS = {
 }
 
 
-@pytest.fixture
-def sooner():
-    """Programs that run once need no optimisation."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-
-
 def answers(net, effect, points):
     """Forces, a gradient of all of them, energy and its gradient, blocks, bound, and how many are reported, of every set of points."""
 

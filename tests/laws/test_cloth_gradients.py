@@ -26,14 +26,6 @@ def breeze(wind, places, time):
     return js.Vector((0.2 * along, 0.5 * along, along))
 
 
-@pytest.fixture
-def sooner():
-    """Programs that run a few times need no optimisation."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-
-
 @pytest.mark.slow
 def test_a_hundred_implicit_steps(sooner):
     """By B, stretch, density, wind and the places of the pins, each against central differences to 1e-5."""

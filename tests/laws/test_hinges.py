@@ -253,14 +253,6 @@ def test_bad_constants_are_refused(arguments, message):
 # --- Implicit steps ---
 
 
-@pytest.fixture
-def sooner():
-    """A program that runs a few times needs no optimisation."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-
-
 @pytest.mark.slow
 def test_a_gradient_through_implicit_steps(sooner):
     """By B and by places, through 20 implicit steps of a strip that hangs over, against central differences."""

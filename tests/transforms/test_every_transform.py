@@ -1,6 +1,5 @@
 """Every transform through every stepper, solver and scheme: the cells of `docs/transforms.md`, measured by `benchmarks.transforms`."""
 
-import jax
 import pytest
 
 from benchmarks import transforms
@@ -9,12 +8,7 @@ from benchmarks import transforms
 FEW = ("vmap(grad)", "jacfwd", "hessian")
 
 
-@pytest.fixture(autouse=True)
-def sooner():
-    """Programs that run once need no optimisation."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
+pytestmark = pytest.mark.usefixtures("sooner")
 
 
 def cells(function, names):

@@ -33,12 +33,7 @@ class Fixed(eqx.Module):
         return self.command
 
 
-@pytest.fixture(autouse=True)
-def sooner():
-    """Programs that run once need no optimisation."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
+pytestmark = pytest.mark.usefixtures("sooner")
 
 
 class Reflex(eqx.Module):

@@ -212,15 +212,13 @@ class Warp(eqx.Module):
         return read.reshape(image.shape)
 
     def _read(self, values: Array, x: Array, y: Array) -> Array:
+        if not jnp.issubdtype(values.dtype, jnp.inexact):
+            # To the nearest grey level, within their range: cut off, every picture would become darker.
+            low, high = (0, 1) if values.dtype == bool else (jnp.iinfo(values.dtype).min, jnp.iinfo(values.dtype).max)
+            return jnp.clip(jnp.rint(self._read(values.astype(x.dtype), x, y)), low, high).astype(values.dtype)
         one, zero = jnp.ones((), x.dtype), jnp.zeros((), x.dtype)
-        levels = values if jnp.issubdtype(values.dtype, jnp.inexact) else values.astype(x.dtype)
-        surface = Surface(self.sampling.coefficients(levels), (one, one), (zero, zero), self.shape, self.sampling)
-        shown = surface.value(x, y)
-        if jnp.issubdtype(values.dtype, jnp.inexact):
-            return shown.astype(values.dtype)
-        # To the nearest grey level, within their range: cut off, every picture would become darker.
-        low, high = (0, 1) if values.dtype == bool else (jnp.iinfo(values.dtype).min, jnp.iinfo(values.dtype).max)
-        return jnp.clip(jnp.rint(shown), low, high).astype(values.dtype)
+        surface = Surface(self.sampling.coefficients(values), (one, one), (zero, zero), self.shape, self.sampling)
+        return surface.value(x, y).astype(values.dtype)
 
     def _check_shape(self, shape: tuple[int, ...]) -> None:
         if tuple(shape) != self.shape:

@@ -55,9 +55,9 @@ def locate_pixels(image: Image, points: np.ndarray, triangles: np.ndarray) -> Lo
     (ny, nx), (sx, sy), (ox, oy) = image.shape, map(float, image.spacing), map(float, image.origin)
     local = (points[:, :2].astype(np.float64) - [ox, oy]) / [sx, sy]
     # A node on the border is there, though the image keeps its spacing and origin in fewer digits.
-    last, rounding = np.array([nx - 1, ny - 1]), ROUNDING * np.array([abs(ox / sx) + nx, abs(oy / sy) + ny])
-    local = np.where(np.abs(local) < np.minimum(rounding, MOST_ROUNDING), 0.0, local)
-    local = np.where(np.abs(local - last) < np.minimum(rounding, MOST_ROUNDING), last, local)
+    rounding = np.minimum(ROUNDING * np.array([abs(ox / sx) + nx, abs(oy / sy) + ny]), MOST_ROUNDING)
+    for border in (np.zeros(2), np.array([nx - 1.0, ny - 1.0])):
+        local = np.where(np.abs(local - border) < rounding, border, local)
     a, b, c = (local[triangles[:, i]] for i in range(3))
     corners = np.stack([a, b, c])
     low = np.maximum(np.ceil(corners.min(axis=0) - EDGE), 0).astype(np.int64)

@@ -64,7 +64,7 @@ def test_a_tin_keeps_map_coordinates(ending, tmp_path, user_mode):
     R.save_tin(path, R.Tin(points, triangles))
     with jax.enable_x64(True):
         _, found = js.from_mesh(path)
-    np.testing.assert_allclose(np.asarray(found), points, atol=1e-6)
+    np.testing.assert_allclose(np.asarray(found), points, rtol=0, atol=1e-6)
 
 
 def test_pixels_of_an_image_of_points_go_by_the_points_within():
